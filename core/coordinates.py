@@ -1,0 +1,98 @@
+"""Frames of reference, the pixel-centre rule, and homographies between planes.
+
+| name    | meaning                                                                                     |
+|---------|---------------------------------------------------------------------------------------------|
+| `raw`   | decoded, upright video pixels, lens distortion in; (0, 0) is the centre of the top-left pixel |
+| `und`   | undistorted pixels, same camera matrix                                                      |
+| `ortho` | orthoimage pixels, u east, v south; (0, 0) is the centre of the north-west pixel             |
+| `plan`  | metres as if on the ground plane: true for the ground, displaced and enlarged for the roof   |
+| `world` | metres, right-handed, z up; true at the target's own height                                  |
+
+A homography is named by where it leads and whence, `H_target_source`, so that in a right chain the inner
+names cancel: `H_plan_undk = H_plan_und0 @ H_und0_undk`. (`canvas`, the browser's CSS pixels, exists only in
+one JavaScript module.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+def read_only(array: ArrayLike) -> Floats:
+    """Return a float64 copy that cannot be written to, for use inside frozen dataclasses."""
+    copy = np.array(array, dtype=np.float64)
+    copy.flags.writeable = False
+    return copy
+
+
+def apply_homography(H: ArrayLike, points: ArrayLike) -> Floats:
+    """Map points through a homography.
+
+    Args:
+        H: (3, 3), any scale.
+        points: (..., 2).
+
+    Returns:
+        (..., 2); points on the line at infinity become inf or nan.
+    """
+    H = np.asarray(H, dtype=np.float64)
+    points = np.asarray(points, dtype=np.float64)
+    mapped = points @ H[:, :2].T + H[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return mapped[..., :2] / mapped[..., 2:]
+
+
+def invert_homography(H: ArrayLike) -> Floats:
+    """Return the homography that leads back, scaled so that its last element is 1."""
+    inverse = np.linalg.inv(np.asarray(H, dtype=np.float64))
+    return inverse / inverse[2, 2]
+
+
+def rotation_2d(angle_rad: float) -> Floats:
+    """Return the (2, 2) matrix that turns plane vectors counter-clockwise by an angle."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, -s], [s, c]])
+
+
+@dataclass(frozen=True)
+class OrthoGrid:
+    """The raster of an orthoimage: where its pixels lie on the ground, north up.
+
+    Attributes:
+        west_m, north_m: world coordinates of the *outer corner* of the north-west pixel.
+        pixel_size_m: edge of a pixel on the ground.
+        width, height: pixels.
+    """
+
+    west_m: float
+    north_m: float
+    pixel_size_m: float
+    width: int
+    height: int
+
+    @property
+    def extent_m(self) -> tuple[float, float, float, float]:
+        """(west, south, east, north) of the outer pixel edges, metres."""
+        return (
+            self.west_m,
+            self.north_m - self.height * self.pixel_size_m,
+            self.west_m + self.width * self.pixel_size_m,
+            self.north_m,
+        )
+
+    @property
+    def H_world_ortho(self) -> Floats:
+        """(3, 3) from pixel centres (u east, v south) to metres (x east, y north): the one place with the mirror."""
+        g = self.pixel_size_m
+        return np.array([[g, 0.0, self.west_m + g / 2], [0.0, -g, self.north_m - g / 2], [0.0, 0.0, 1.0]])
+
+    @property
+    def H_ortho_world(self) -> Floats:
+        """(3, 3) from metres to pixel centres."""
+        return np.linalg.inv(self.H_world_ortho)

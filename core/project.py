@@ -1,0 +1,289 @@
+"""`project.json`: the one definition of everything a person decides.
+
+These models are also the wire types of the browser interface. They are frozen: an edit makes a new project.
+Only the file's own consistency is checked here; whether the inputs fit together is checked by `core.check`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from core.errors import InputError
+
+PROJECT_FILE = "project.json"
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Point = tuple[Finite, Finite]
+Interval = tuple[Finite, Finite]
+Method = Literal["geometric", "paper"]
+
+LINE_NAMES = ("L1", "L2", "T1")
+
+
+class Model(BaseModel):
+    """Frozen, and refuses keys it does not know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class GpsInput(Model):
+    """A GPS record and the names of its columns."""
+
+    file: str
+    time: str = "time_s"
+    x: str = "east_m"
+    y: str = "north_m"
+    at_m: Point | None = Field(default=None, description="antenna position on the roof, world metres at roof level")
+
+
+class Inputs(Model):
+    """Files measured from; paths are relative to the project folder."""
+
+    video: str
+    cloud: str | None = None
+    lens: str | None = None
+    gps: GpsInput | None = None
+
+
+class Orthoimage(Model):
+    """Raster of the orthoimage and the height of the ground in the cloud."""
+
+    pixel_size_m: Positive = 0.01
+    extent_m: tuple[Finite, Finite, Finite, Finite] | None = Field(default=None, description="west, south, east, north")
+    ground_z_m: Finite | None = None
+
+    @field_validator("extent_m")
+    @classmethod
+    def _ordered(cls, extent: tuple[float, float, float, float] | None) -> tuple[float, float, float, float] | None:
+        if extent is not None and not (extent[0] < extent[2] and extent[1] < extent[3]):
+            raise ValueError("must be [west, south, east, north] with west < east and south < north")
+        return extent
+
+
+class Correspondence(Model):
+    """One clicked pair: a place on the ground (world metres) and in the raw reference frame (pixels)."""
+
+    id: int
+    ground_m: Point
+    frame_px: Point
+    enabled: bool = True
+
+
+class Band(Model):
+    """Search band of one roof line on the orthorectified reference frame, in plan metres."""
+
+    from_m: Point
+    to_m: Point
+    width_m: Positive = 0.5
+
+    @model_validator(mode="after")
+    def _has_length(self) -> Band:
+        if (self.to_m[0] - self.from_m[0]) ** 2 + (self.to_m[1] - self.from_m[1]) ** 2 < 1e-6:
+            raise ValueError("from_m and to_m are the same place; a band needs a length")
+        return self
+
+
+class Lines(Model):
+    """The three lines of a target: L1 and L2 side by side, T1 across them."""
+
+    L1: Band
+    L2: Band
+    T1: Band
+
+
+class Target(Model):
+    """Something that moves and is measured: a roof, a shake table, a storey."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")
+    kind: Literal["lines", "points"] = "lines"
+    height_m: Finite | None = None
+    p1_p2_m: Positive | None = None
+    lines: Lines | None = None
+    region_m: tuple[Point, ...] | None = None
+    relative_to: str | None = None
+
+    @model_validator(mode="after")
+    def _has_its_kind(self) -> Target:
+        if self.kind == "lines" and self.lines is None:
+            raise ValueError('a target of kind "lines" needs "lines" with the bands L1, L2 and T1')
+        if self.kind == "points" and (self.region_m is None or len(self.region_m) < 3):
+            raise ValueError('a target of kind "points" needs "region_m" with three or more corners')
+        return self
+
+
+class Intervals(Model):
+    """Named parts of the video, seconds from its first frame."""
+
+    pre_event: Interval | None = None
+    event: Interval | None = None
+    residual: Interval | None = None
+
+    @field_validator("pre_event", "event", "residual")
+    @classmethod
+    def _ordered(cls, interval: Interval | None) -> Interval | None:
+        if interval is not None and not interval[0] < interval[1]:
+            raise ValueError("must be [start, end] with start < end")
+        return interval
+
+
+class Drift(Model):
+    """High-pass filter of the paper; none where geometry has removed the drift."""
+
+    filter: Literal["none", "high-pass"] = "none"
+    order: Annotated[int, Field(ge=1, le=20)] = 10
+    corner_hz: Positive = 0.25
+
+
+class Project(Model):
+    """Everything a person decided about one measurement."""
+
+    rooftrack: Literal[1] = 1
+    name: Annotated[str, Field(min_length=1)]
+    inputs: Inputs
+    orthoimage: Orthoimage = Orthoimage()
+    reference_frame: Annotated[int, Field(ge=0)] = 0
+    correspondences: tuple[Correspondence, ...] = ()
+    moving_regions_px: tuple[tuple[Point, ...], ...] = ()
+    targets: tuple[Target, ...] = ()
+    excluded_frames: tuple[tuple[int, int], ...] = ()
+    intervals_s: Intervals = Intervals()
+    method: Method = "geometric"
+    drift: Drift = Drift()
+
+    @field_validator("correspondences")
+    @classmethod
+    def _ids_differ(cls, pairs: tuple[Correspondence, ...]) -> tuple[Correspondence, ...]:
+        _refuse_twice("id", (pair.id for pair in pairs))
+        return pairs
+
+    @field_validator("moving_regions_px")
+    @classmethod
+    def _are_polygons(cls, regions: tuple[tuple[Point, ...], ...]) -> tuple[tuple[Point, ...], ...]:
+        for number, region in enumerate(regions):
+            if len(region) < 3:
+                raise ValueError(f"region {number} has {len(region)} corners; a polygon needs three or more")
+        return regions
+
+    @field_validator("excluded_frames")
+    @classmethod
+    def _ranges_ordered(cls, ranges: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
+        for first, last in ranges:
+            if not 0 <= first <= last:
+                raise ValueError(f"[{first}, {last}] must be [first, last] with 0 <= first <= last")
+        return ranges
+
+    @field_validator("targets")
+    @classmethod
+    def _targets_refer(cls, targets: tuple[Target, ...]) -> tuple[Target, ...]:
+        _refuse_twice("name", (target.name for target in targets))
+        by_name = {target.name: target for target in targets}
+        for target in targets:
+            if target.relative_to is None:
+                continue
+            base = by_name.get(target.relative_to)
+            if base is None or base is target:
+                raise ValueError(f'"{target.name}" is relative to "{target.relative_to}", which is no other target')
+            if base.relative_to is not None:
+                raise ValueError(f'"{target.name}" is relative to "{base.name}", which is itself relative')
+        return targets
+
+    def is_excluded(self, frame: int) -> bool:
+        """Whether a person rejected this frame."""
+        return any(first <= frame <= last for first, last in self.excluded_frames)
+
+
+def _refuse_twice(what: str, values: Iterable[object]) -> None:
+    seen: set[object] = set()
+    for value in values:
+        if value in seen:
+            raise ValueError(f"{what} {value!r} is used twice")
+        seen.add(value)
+
+
+def read_project(folder: Path) -> Project:
+    """Read and check `project.json` of a project folder.
+
+    Raises:
+        InputError: the file is missing, is not JSON, or breaks its definition; every problem is named with its path.
+    """
+    file = folder / PROJECT_FILE
+    try:
+        text = file.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{file}: not found; make a project with `rooftrack new {folder} --video FILE`.") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: cannot be read ({error}); restore it from a copy.") from None
+    return parse_project(text, file)
+
+
+def parse_project(text: str, file: Path | str = PROJECT_FILE) -> Project:
+    """Return the project a JSON text describes; `file` is named in messages.
+
+    Raises:
+        InputError: with every problem and its path in the file.
+    """
+    try:
+        document = json.loads(text)
+    except json.JSONDecodeError as error:
+        place = f"line {error.lineno}, column {error.colno}"
+        raise InputError(f"{file}: {place} is not valid JSON ({error.msg}); correct it there.") from None
+    problems = project_problems(document)
+    if problems:
+        raise InputError(f"{file}: " + "; ".join(problems) + ".")
+    return Project.model_validate(document)
+
+
+def project_problems(document: Any) -> list[str]:
+    """Return each problem of a parsed `project.json`, `path: what is wrong and what to do`; none means valid."""
+    try:
+        Project.model_validate(document)
+    except ValidationError as error:
+        return [_sentence(entry["loc"], entry["type"], entry["msg"], entry.get("input")) for entry in error.errors()]
+    return []
+
+
+def _sentence(location: tuple[int | str, ...], kind: str, message: str, value: object) -> str:
+    path = re.sub(r"\.\[", "[", ".".join(f"[{part}]" if isinstance(part, int) else part for part in location)) or "top"
+    if kind == "extra_forbidden":
+        return f'{path}: unknown key "{location[-1]}", remove it or correct its spelling'
+    if kind == "missing":
+        return f"{path}: missing, add it"
+    message = message.removeprefix("Value error, ")
+    if kind == "value_error":
+        return f"{path}: {message}"
+    return f"{path}: {message[0].lower()}{message[1:]}, not {_shortened(value)}"
+
+
+def _shortened(value: object) -> str:
+    text = json.dumps(value, default=str)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def write_project(folder: Path, project: Project) -> None:
+    """Write `project.json` atomically: a crash leaves the old file or the new one, never half of one."""
+    write_atomically(folder / PROJECT_FILE, project_json(project).encode())
+
+
+def project_json(project: Project) -> str:
+    """Return the file's text: short lists on one line, so that a person can read and edit it."""
+    text = json.dumps(project.model_dump(mode="json"), indent=2, ensure_ascii=False)
+    flat_list = re.compile(r"\[\s+((?:[^\[\]{}\"]|\"[^\"]*\")*?)\s+\]")
+    return flat_list.sub(lambda found: "[" + re.sub(r"\s*\n\s*", " ", found.group(1)) + "]", text) + "\n"
+
+
+def write_atomically(file: Path, content: bytes) -> None:
+    """Replace a file's content in one step, durable before it takes the old one's place."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_name(f".{file.name}.{os.getpid()}.part")
+    with part.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    os.replace(part, file)
