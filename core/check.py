@@ -1,0 +1,223 @@
+"""Everything that keeps a project from being measured and can be told without measuring.
+
+Each problem is one line: the file, the place in it, what is wrong and what to do. Nothing is written.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from core.cloud import Cloud, fit_ground_plane, read_cloud
+from core.coordinates import Floats
+from core.errors import InputError
+from core.intervals import within
+from core.lens import Lens, read_lens, require_image_size
+from core.progress import Progress, silent
+from core.project import LINE_NAMES, PROJECT_FILE, Band, Lines, Project, Target, project_problems, read_project
+from core.video import FrameIndex, VideoInfo, frame_index, probe
+
+# Four pairs determine a homography; fewer leave it open.
+MIN_CORRESPONDENCES = 4
+# Lines that cross at a smaller angle have an intersection that runs along both with every small error.
+MIN_CROSSING_RAD = np.radians(20.0)
+# L1 and L2 closer than a strip is wide are one line clicked twice.
+MIN_P1_P2_M = 0.05
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """The inputs that could be read; None where there is none or it is a problem already told."""
+
+    info: VideoInfo | None
+    index: FrameIndex | None
+    lens: Lens | None
+    cloud: Cloud | None
+
+
+def check_project(folder: Path, progress: Progress = silent) -> list[str]:
+    """Return each problem of a project folder, one line each with its remedy; none means that it can be measured."""
+    file = folder / PROJECT_FILE
+    try:
+        project = read_project(folder)
+    except InputError as error:
+        return _problems_of_file(file) or [str(error)]
+    problems: list[str] = []
+    inputs = _read_inputs(folder, project, problems, progress)
+    for check in (_video_problems, _correspondence_problems, _region_problems, _target_problems, _time_problems):
+        problems += [f"{file}: {problem}." for problem in check(project, inputs)]
+    return problems
+
+
+def _problems_of_file(file: Path) -> list[str]:
+    """Return the problems of a `project.json` one by one; none where it cannot be parsed at all."""
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return []
+    return [f"{file}: {problem}." for problem in project_problems(document)]
+
+
+def _read_inputs(folder: Path, project: Project, problems: list[str], progress: Progress) -> _Inputs:
+    def tried(read: Callable[..., Result], *arguments: object) -> Result | None:
+        try:
+            return read(*arguments)
+        except InputError as error:
+            problems.append(str(error))
+            return None
+
+    given = project.inputs
+    video = folder / given.video
+    info = tried(probe, video)
+    index = tried(frame_index, video) if info else None
+    lens = tried(read_lens, folder / given.lens) if given.lens else None
+    if given.lens and lens and info:
+        tried(_require_lens_of_video, lens, folder / given.lens, info, video)
+    cloud = tried(read_cloud, folder / given.cloud, progress) if given.cloud else None
+    if cloud:
+        tried(fit_ground_plane, cloud, project.orthoimage.ground_z_m)
+    return _Inputs(info=info, index=index, lens=lens, cloud=cloud)
+
+
+def _require_lens_of_video(lens: Lens, lens_file: Path, info: VideoInfo, video: Path) -> None:
+    require_image_size(lens, width=info.width, height=info.height, lens_file=lens_file, video_file=video)
+
+
+def _video_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
+    if inputs.index is None:
+        return
+    frames = len(inputs.index)
+    if project.reference_frame >= frames:
+        yield f"reference_frame: is {project.reference_frame}, but the video ends with frame {frames - 1}; lower it"
+    for number, (first, last) in enumerate(project.excluded_frames):
+        if last >= frames:
+            yield f"excluded_frames[{number}]: [{first}, {last}] ends after the last frame, {frames - 1}; shorten it"
+
+
+def _correspondence_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
+    enabled = [pair for pair in project.correspondences if pair.enabled]
+    if len(enabled) < MIN_CORRESPONDENCES:
+        yield (
+            f"correspondences: {len(enabled)} enabled, but the reference frame needs {MIN_CORRESPONDENCES} or more, "
+            "better 20; click more pairs"
+        )
+    if project.method == "geometric" and project.inputs.lens is None:
+        yield 'inputs.lens: missing, but method "geometric" needs it; calibrate with rooftrack lens, or choose "paper"'
+    for pair in enabled:
+        if inputs.info and not _within_frame(pair.frame_px, inputs.info):
+            u, v = pair.frame_px
+            size = f"{inputs.info.width} x {inputs.info.height}"
+            yield f"correspondences: id {pair.id}: frame_px [{u:g}, {v:g}] is outside the {size} frame; click it again"
+        if inputs.cloud and not _within_cloud(pair.ground_m, inputs.cloud):
+            x, y = pair.ground_m
+            yield f"correspondences: id {pair.id}: ground_m [{x:g}, {y:g}] lies outside the point cloud; click it again"
+
+
+def _within_frame(place_px: tuple[float, float], info: VideoInfo) -> bool:
+    u, v = place_px
+    return -0.5 <= u <= info.width - 0.5 and -0.5 <= v <= info.height - 0.5
+
+
+def _within_cloud(place_m: tuple[float, float], cloud: Cloud) -> bool:
+    lowest, highest = cloud.extent_m
+    return bool(np.all(lowest[:2] <= place_m) and np.all(place_m <= highest[:2]))
+
+
+def _region_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
+    if not project.moving_regions_px:
+        yield "moving_regions_px: none, so the building would count as ground; outline all that moves"
+    for number, region in enumerate(project.moving_regions_px):
+        if inputs.info and not _overlaps_frame(np.array(region), inputs.info):
+            yield f"moving_regions_px[{number}]: lies wholly outside the frame; outline it again"
+
+
+def _overlaps_frame(region_px: Floats, info: VideoInfo) -> bool:
+    lowest, highest = region_px.min(axis=0), region_px.max(axis=0)
+    return bool(highest[0] >= 0 and highest[1] >= 0 and lowest[0] <= info.width - 1 and lowest[1] <= info.height - 1)
+
+
+def _target_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
+    if not project.targets:
+        yield "targets: none; add a roof with its search bands L1, L2 and T1"
+    for number, target in enumerate(project.targets):
+        place = f"targets[{number}]"
+        if project.method == "geometric" and target.height_m is None:
+            yield f'{place}.height_m: missing, but method "geometric" needs the height of "{target.name}"; add it'
+        if target.lines is not None and target.kind == "lines":
+            yield from _line_problems(target.lines, place)
+        for name, point in _corners(target):
+            if project.orthoimage.extent_m and not _within_extent(point, project.orthoimage.extent_m):
+                x, y = point
+                yield f"{place}.{name}: [{x:g}, {y:g}] lies outside orthoimage.extent_m; move it or enlarge the extent"
+
+
+def _corners(target: Target) -> Iterator[tuple[str, tuple[float, float]]]:
+    if target.kind == "points":
+        for number, corner in enumerate(target.region_m or ()):
+            yield f"region_m[{number}]", corner
+    elif target.lines is not None:
+        for name in LINE_NAMES:
+            band: Band = getattr(target.lines, name)
+            yield f"lines.{name}.from_m", band.from_m
+            yield f"lines.{name}.to_m", band.to_m
+
+
+def _within_extent(place_m: tuple[float, float], extent_m: tuple[float, float, float, float]) -> bool:
+    west, south, east, north = extent_m
+    return west <= place_m[0] <= east and south <= place_m[1] <= north
+
+
+def _line_problems(lines: Lines, place: str) -> Iterator[str]:
+    """Say where L1 and L2 do not cross T1 in two places well apart."""
+    crossings = []
+    for name, band in (("L1", lines.L1), ("L2", lines.L2)):
+        crossing = _crossing(band, lines.T1)
+        if crossing is None:
+            yield f"{place}.lines: {name} and T1 run nearly the same way, so they cross nowhere well; turn one of them"
+        else:
+            crossings.append(crossing)
+    if len(crossings) == 2 and np.hypot(*(crossings[0] - crossings[1])) < MIN_P1_P2_M:
+        yield f"{place}.lines: L1 and L2 cross T1 in the same place; put them on two different roof lines"
+
+
+def _crossing(line: Band, across: Band) -> Floats | None:
+    """Return where two bands' axes cross (2,), plan metres; None where they are nearly parallel."""
+    start, start_across = np.array(line.from_m), np.array(across.from_m)
+    along, along_across = np.array(line.to_m) - start, np.array(across.to_m) - start_across
+    area = along[0] * along_across[1] - along[1] * along_across[0]
+    if abs(area) < np.sin(MIN_CROSSING_RAD) * np.hypot(*along) * np.hypot(*along_across):
+        return None
+    between = start_across - start
+    return np.asarray(start + along * (between[0] * along_across[1] - between[1] * along_across[0]) / area)
+
+
+def _time_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
+    if inputs.index is None:
+        return
+    times_s = inputs.index.time_s
+    end_s = float(times_s[-1])
+    # An interval may end with the last frame's own duration.
+    last_s = end_s + float(np.median(np.diff(times_s))) if len(times_s) > 1 else end_s
+    for name in ("pre_event", "event", "residual"):
+        interval = getattr(project.intervals_s, name)
+        if interval and not (interval[0] >= 0 and interval[1] <= last_s):
+            yield (
+                f"intervals_s.{name}: [{interval[0]:g}, {interval[1]:g}] reaches outside the video, "
+                f"which lasts from 0 to {end_s:.3f} s; shorten it"
+            )
+        elif interval and not within(times_s, interval).any():
+            yield f"intervals_s.{name}: [{interval[0]:g}, {interval[1]:g}] holds no frame; lengthen it"
+    if project.drift.filter == "high-pass" and len(times_s) > 1:
+        nyquist_hz = 0.5 / float(np.median(np.diff(times_s)))
+        if project.drift.corner_hz >= nyquist_hz:
+            yield (
+                f"drift.corner_hz: {project.drift.corner_hz:g} is not below {nyquist_hz:g} Hz, half the frame rate; "
+                "lower it"
+            )
