@@ -1,0 +1,324 @@
+"""Point clouds in files anyone can write: PLY, PCD and columns of text, read in float64 without other libraries.
+
+Whatever a file calls its columns, they arrive here as one table of named columns; `core.cloud` makes a cloud of them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.coordinates import Floats
+from core.errors import InputError
+from core.progress import Progress
+
+_TEXT_CHUNK_ROWS = 500_000
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf".decode("latin-1")
+
+# What surveyors, scanners and programs call the same column.
+_COLUMN_NAMES = {
+    "x": ("x", "east", "easting", "east_m", "x_m", "//x"),
+    "y": ("y", "north", "northing", "north_m", "y_m"),
+    "z": ("z", "height", "elevation", "up", "up_m", "z_m", "altitude"),
+    "intensity": ("intensity", "scalar_intensity", "i", "reflectance", "scalar_reflectance"),
+    "red": ("red", "r", "diffuse_red"),
+    "green": ("green", "g", "diffuse_green"),
+    "blue": ("blue", "b", "diffuse_blue"),
+}
+_COLUMN_OF_NAME = {name: column for column, names in _COLUMN_NAMES.items() for name in names}
+
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PointTable:
+    """Points as a file gives them.
+
+    Attributes:
+        xyz: (N, 3) float64, the file's own coordinates, metres.
+        rgb: (N, 3), the file's own range, or None.
+        intensity: (N,) float32 or None.
+        stored_in_float32: whether the file kept coordinates in single precision.
+    """
+
+    xyz: Floats
+    rgb: NDArray[Any] | None = None
+    intensity: NDArray[np.float32] | None = None
+    stored_in_float32: bool = False
+
+
+def read_ply(path: Path, progress: Progress) -> PointTable:
+    """Read the vertices of a PLY file, ascii or binary.
+
+    Raises:
+        InputError: the header is damaged, vertices lack x y z, or the file ends early.
+    """
+    with path.open("rb") as stream:
+        encoding, elements = _ply_header(path, stream)
+        names = [name for name, _, _ in elements]
+        if "vertex" not in names:
+            raise InputError(f"{path}: its header has no vertex element; export the points again.")
+        before = elements[: names.index("vertex")]
+        _, count, properties = elements[names.index("vertex")]
+        if any("list" in kind for _, _, earlier in [*before, elements[names.index("vertex")]] for _, kind in earlier):
+            raise InputError(f"{path}: has list properties before or in its vertices; export it as points only.")
+        if encoding == "ascii":
+            for _ in range(sum(lines for _, lines, _ in before)):
+                stream.readline()
+            values = _text_rows(path, stream, _header_lines(path), columns=len(properties), rows=count)
+            _require_count(path, len(values), count)
+            table: Any = {name: values[:, column] for column, (name, _) in enumerate(properties)}
+        else:
+            order = "<" if encoding == "binary_little_endian" else ">"
+            for _, lines, earlier in before:
+                stream.seek(lines * sum(np.dtype(kind).itemsize for _, kind in earlier), 1)
+            dtype = np.dtype([(name, order + kind) for name, kind in properties])
+            table = _records(path, stream, dtype, count)
+    progress("cloud", 1, 1)
+    float32 = encoding != "ascii" and dict(properties).get("x") == "f4"
+    return _table(path, [name for name, _ in properties], table, float32)
+
+
+def _ply_header(path: Path, stream: IO[bytes]) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]]]:
+    """Return the encoding and each element's name, count and (property, numpy type), up to `end_header`."""
+    if stream.readline().strip() != b"ply":
+        raise InputError(f"{path}: does not begin with `ply`; give a PLY file or name it by its true format.")
+    encoding, elements = "", list[tuple[str, int, list[tuple[str, str]]]]()
+    for _ in range(1000):
+        words = stream.readline().decode("latin-1").split()
+        try:
+            match words:
+                case ["end_header"]:
+                    if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
+                        break
+                    return encoding, elements
+                case ["format", encoding, *_]:
+                    pass
+                case ["element", name, count]:
+                    elements.append((name, int(count), []))
+                case ["property", "list", *_, name]:
+                    elements[-1][2].append((name, "list"))
+                case ["property", kind, name]:
+                    elements[-1][2].append((name, _PLY_TYPES[kind]))
+        except (ValueError, KeyError, IndexError):
+            raise InputError(f"{path}: header line `{' '.join(words)}` is not PLY; export the file again.") from None
+    raise InputError(f"{path}: its PLY header does not end or names no known format; export the file again.")
+
+
+def _header_lines(path: Path) -> int:
+    with path.open("rb") as stream:
+        return next(number for number, line in enumerate(stream, start=1) if line.strip() == b"end_header")
+
+
+def read_pcd(path: Path, progress: Progress) -> PointTable | None:
+    """Read a PCD file, ascii or binary; None for binary_compressed, which is left to open3d.
+
+    Raises:
+        InputError: the header is damaged, x y z are missing, or the file ends early.
+    """
+    with path.open("rb") as stream:
+        header, lines = _pcd_header(path, stream)
+        try:
+            sizes, counts = [int(word) for word in header["SIZE"]], [int(word) for word in header["COUNT"]]
+            types = [kind.lower() + str(size) for kind, size in zip(header["TYPE"], sizes, strict=True)]
+            fields = list(zip(header["FIELDS"], types, counts, strict=True))
+            count, encoding = int(header["POINTS"][0]), header["DATA"][0]
+        except (KeyError, ValueError, IndexError):
+            raise InputError(f"{path}: its PCD header is incomplete or inconsistent; export the file again.") from None
+        names = [name if width == 1 else f"{name}*{width}" for name, _, width in fields]
+        if encoding == "ascii":
+            firsts = np.cumsum([0, *counts[:-1]])
+            values = _text_rows(path, stream, lines, columns=sum(counts), rows=count)
+            _require_count(path, len(values), count)
+            table: Any = {name: values[:, first] for name, first in zip(names, firsts, strict=True)}
+        elif encoding == "binary":
+            unique = [f"_{i}" if name == "_" else name for i, name in enumerate(names)]
+            dtype = np.dtype([(n, "<" + kind, (w,)) if w > 1 else (n, "<" + kind)
+                              for n, (_, kind, w) in zip(unique, fields, strict=True)])  # fmt: skip
+            table = _records(path, stream, dtype, count)
+        else:
+            return None
+    progress("cloud", 1, 1)
+    float32 = encoding == "binary" and dict(zip(names, types, strict=True)).get("x") == "f4"
+    packed = {name: table[name] for name in ("rgb", "rgba") if name in names}
+    result = _table(path, names, table, float32)
+    for value, kind in ((value, types[names.index(name)]) for name, value in packed.items()):
+        result = PointTable(result.xyz, _unpacked_rgb(value, kind), result.intensity, result.stored_in_float32)
+    return result
+
+
+def _pcd_header(path: Path, stream: IO[bytes]) -> tuple[dict[str, list[str]], int]:
+    header: dict[str, list[str]] = {}
+    for number in range(1, 101):
+        words = stream.readline().decode("latin-1").split()
+        if words and not words[0].startswith("#"):
+            header[words[0].upper()] = words[1:]
+            if words[0].upper() == "DATA":
+                header.setdefault("COUNT", ["1"] * len(header.get("FIELDS", [])))
+                return header, number
+    raise InputError(f"{path}: has no PCD header that ends in DATA; give a PCD file or name it by its true format.")
+
+
+def _unpacked_rgb(packed: NDArray[Any], kind: str) -> NDArray[np.uint8]:
+    """Split PCL's colour, four bytes that are declared a float or an integer, into (N, 3)."""
+    whole = packed.astype(np.float32).view(np.uint32) if kind.startswith("f") else packed.astype(np.uint32)
+    return np.stack([(whole >> shift) & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
+
+
+def read_text(path: Path, progress: Progress) -> PointTable:
+    """Read columns of numbers: XYZ, PTS, TXT or CSV, with or without a line of names.
+
+    Without names the columns are x y z, then intensity (4 columns), red green blue (6), or intensity red green
+    blue (7, as PTS has them).
+
+    Raises:
+        InputError: a line is not what the first one promises; the line is named.
+    """
+    layout = _text_layout(path)
+    size, parts = max(path.stat().st_size, 1), []
+    with path.open("rb") as stream:
+        for _ in range(layout.skip):
+            stream.readline()
+        lines_before = layout.skip
+        while True:
+            part = _text_rows(path, stream, lines_before, columns=len(layout.names), rows=_TEXT_CHUNK_ROWS)
+            if not len(part):
+                break
+            parts.append(part)
+            lines_before += len(part)
+            progress("cloud", int(1000 * stream.tell() / size), 1000)
+    if not parts:
+        raise InputError(f"{path}: holds no points; export it again.")
+    values = np.concatenate(parts) if len(parts) > 1 else parts[0]
+    if layout.count is not None and len(values) != layout.count:
+        _require_count(path, len(values), layout.count)
+        values = values[: layout.count]
+    return _table(path, layout.names, {name: values[:, i] for i, name in enumerate(layout.names)}, False)
+
+
+@dataclass(frozen=True)
+class _TextLayout:
+    skip: int
+    names: list[str]
+    count: int | None
+
+
+def _text_layout(path: Path) -> _TextLayout:
+    """Look at the first lines: what to skip, what the columns are, how many points a PTS file promises."""
+    names, count = list[str](), None
+    with path.open("rb") as stream:
+        for number, line in enumerate(stream):
+            words = _words(line)
+            if number > 100:
+                break
+            if not words or (line.lstrip().startswith((b"#", b"//")) and not _as_names(words)):
+                continue
+            if _as_names(words):
+                names = [_COLUMN_OF_NAME.get(word.lower().lstrip("#/"), word.lower()) for word in words if word != "#"]
+            elif len(words) == 1 and words[0].isdigit():
+                count = int(words[0])
+            elif len(words) >= 3 and _all_numbers(words):
+                return _TextLayout(number, names or _names_by_number(path, stream, words), count)
+            else:
+                raise InputError(
+                    f"{path}: line {number + 1} is neither names of columns with x, y and z nor three or more numbers; "
+                    "export the points as text again."
+                )
+    raise InputError(f"{path}: holds no points; export it again.")
+
+
+def _words(line: bytes) -> list[str]:
+    return [word.strip('"') for word in re.split(r"[\s,;]+", _spaced(line)) if word]
+
+
+def _as_names(words: list[str]) -> bool:
+    found = {_COLUMN_OF_NAME.get(word.lower().lstrip("#/")) for word in words}
+    return {"x", "y", "z"} <= found
+
+
+def _all_numbers(words: list[str]) -> bool:
+    try:
+        [float(word) for word in words]
+    except ValueError:
+        return False
+    return True
+
+
+def _names_by_number(path: Path, stream: IO[bytes], first: list[str]) -> list[str]:
+    by_count = {
+        3: [],
+        4: ["intensity"],
+        6: ["red", "green", "blue"],
+        7: ["intensity", "red", "green", "blue"],
+    }
+    if len(first) not in by_count:
+        raise InputError(f"{path}: has {len(first)} columns without names; add a first line that names x, y and z.")
+    names = ["x", "y", "z", *by_count[len(first)]]
+    sample = [first, *(_words(line) for line, _ in zip(stream, range(200), strict=False))]
+    colours = [[float(word) for word in row[-3:]] for row in sample if len(row) == len(first) and _all_numbers(row)]
+    if "red" in names and any(value < 0 or value != int(value) for row in colours for value in row):
+        # Three more columns with signs or fractions are normals, not colours.
+        names[-3:] = ["normal_x", "normal_y", "normal_z"]
+    return names
+
+
+def _text_rows(path: Path, stream: IO[bytes], lines_before: int, *, columns: int, rows: int) -> Floats:
+    """Read up to `rows` lines of `columns` numbers, however they are separated."""
+    lines = [_spaced(line) for line in itertools.islice(stream, rows)]
+    if not any(line.strip() and not line.startswith(("#", "//")) for line in lines):
+        return np.empty((0, columns))
+    try:
+        values: Floats = np.loadtxt(lines, dtype=np.float64, ndmin=2, comments=("#", "//"))
+    except ValueError:
+        values = np.empty((0, 0))
+    if values.shape[1] == columns:
+        return values
+    wrong = next(number for number, line in enumerate(lines, start=lines_before + 1) if not _holds(line, columns))
+    raise InputError(f"{path}: line {wrong} does not hold {columns} numbers as it should; correct or remove it.")
+
+
+def _holds(line: str, columns: int) -> bool:
+    words = line.split()
+    return not words or line.startswith(("#", "//")) or (len(words) == columns and _all_numbers(words))
+
+
+def _spaced(line: bytes) -> str:
+    return line.decode("latin-1").removeprefix(_BYTE_ORDER_MARK).replace(",", " ").replace(";", " ").lstrip()
+
+
+def _records(path: Path, stream: IO[bytes], dtype: np.dtype[Any], count: int) -> NDArray[Any]:
+    content = stream.read(count * dtype.itemsize)
+    _require_count(path, len(content) // dtype.itemsize, count)
+    return np.frombuffer(content, dtype=dtype, count=count)
+
+
+def _require_count(path: Path, found: int, promised: int) -> None:
+    if found < promised:
+        raise InputError(f"{path}: ends after {found} of {promised} points; copy it again, it is cut off.")
+
+
+def _table(path: Path, names: list[str], columns: Any, float32: bool) -> PointTable:
+    by_meaning = {_COLUMN_OF_NAME.get(name.lower(), name.lower()): name for name in reversed(names)}
+    missing = [axis for axis in "xyz" if axis not in by_meaning]
+    if missing:
+        raise InputError(f"{path}: has no column {' and '.join(missing)}; its columns are {', '.join(names)}.")
+
+    def column(meaning: str) -> NDArray[Any]:
+        return np.asarray(columns[by_meaning[meaning]])
+
+    xyz = np.stack([column(axis).astype(np.float64) for axis in "xyz"], axis=1)
+    rgb = None
+    if {"red", "green", "blue"} <= by_meaning.keys():
+        rgb = np.stack([column(channel) for channel in ("red", "green", "blue")], axis=1)
+    intensity = column("intensity").astype(np.float32) if "intensity" in by_meaning else None
+    return PointTable(xyz, rgb, intensity, float32)
