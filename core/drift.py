@@ -243,7 +243,8 @@ def dominant_frequency(values_m: ArrayLike, time_s: ArrayLike, intervals: Interv
     """Return the frequency at which a target moves most during the event, drift left aside.
 
     Drift is what the pre-event shows too, and it weakens with frequency: only frequencies count at which the event
-    stands three times above all that the pre-event holds from one octave lower upwards. None where the event is not given, not measured, or does not stand out.
+    stands three times above all that the pre-event holds from one octave lower upwards. None where the event is not
+    given, not measured, or does not stand out.
 
     Args:
         values_m: (F,) unfiltered displacement along one axis.

@@ -173,6 +173,21 @@ def relative_history(
     )
 
 
+def displacement_at(history: TargetHistory, *, rest_m: ArrayLike, at_m: ArrayLike) -> Floats:
+    """Return the displacement of any place on a target, such as a GPS antenna, by its rigid motion.
+
+    Args:
+        history: of the target.
+        rest_m: (2, 2) P1 and P2 at rest, world metres.
+        at_m: (2,) the place at rest, world metres.
+
+    Returns:
+        (F, 2) metres, NaN where not measured.
+    """
+    arm_m = np.asarray(at_m, dtype=np.float64) - np.asarray(rest_m, dtype=np.float64).mean(axis=0)
+    return _carried(history.p1_m, history.p2_m, history.rotation_rad, arm_m)
+
+
 def _carried(p1_m: Floats, p2_m: Floats, rotation_rad: Floats, arm_m: Floats) -> Floats:
     """Return (F, 2) how far a rigid body carries the place at `arm_m` (2,) from the middle of its P1 and P2."""
     less_cosine, sine = 1 - np.cos(rotation_rad), np.sin(rotation_rad)

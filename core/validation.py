@@ -1,0 +1,413 @@
+"""Comparison with GPS: clock lag, error history, and the rows of the paper's Table 2.
+
+Sign of the lag: GPS time + lag = video time.
+
+Source: the paper's "Validation of Motion-Tracking Results", Fig. 11 and Table 2.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+from scipy.optimize import minimize_scalar
+from scipy.signal import correlate
+
+from core.coordinates import Bools, Floats, read_only
+from core.errors import InputError
+from core.intervals import within
+from core.project import GpsInput, Intervals
+
+# Velocities of the same motion correlate above 0.9; of two records of noise, below 0.3 at every lag tried.
+_LEAST_CORRELATION = 0.5
+# A GPS time is compared where the video was measured on both sides, not farther apart than this many frames.
+_BRIDGED_FRAMES = 3.5
+
+
+@dataclass(frozen=True)
+class GpsRecord:
+    """Positions of an antenna on the target.
+
+    Attributes:
+        name: of the file, for messages.
+        time_s: (G,) increasing, the receiver's own clock.
+        position_m: (G, 2) east and north, any origin.
+    """
+
+    name: str
+    time_s: Floats
+    position_m: Floats
+
+
+@dataclass(frozen=True)
+class ComparisonRow:
+    """One figure of Table 2: the same quantity from the video and from GPS, metres."""
+
+    video_m: float
+    gps_m: float
+
+    @property
+    def error_m(self) -> float:
+        """Video less GPS."""
+        return self.video_m - self.gps_m
+
+    @property
+    def error_percent(self) -> float | None:
+        """Absolute error in percent of the GPS value; None where that is zero."""
+        return 100 * abs(self.error_m / self.gps_m) if self.gps_m else None
+
+
+@dataclass(frozen=True)
+class GpsComparison:
+    """What the video and GPS say about the same motion.
+
+    Attributes:
+        lag_s: added to GPS times to get video times; 0 where it could not be told.
+        lag_sigma_s: one standard deviation; None where the lag could not be told.
+        correlation: of the two velocities at that lag, -1 to 1.
+        message: a sentence where something could not be told, else empty.
+        time_s: (N,) GPS samples that lie within the video, in video time.
+        gps_m: (N, 2) GPS displacement from its mean over the pre-event.
+        video_m: (N, 2) video at the same times, NaN where not measured.
+        error_m: (N, 2) video less GPS.
+        rms_m: (2,) of the error.
+        peak_positive, peak_negative, residual: per axis x, y; None where not measured or no interval is given.
+    """
+
+    lag_s: float
+    lag_sigma_s: float | None
+    correlation: float
+    message: str
+    time_s: Floats
+    gps_m: Floats
+    video_m: Floats
+    error_m: Floats
+    rms_m: Floats
+    peak_positive: tuple[ComparisonRow | None, ComparisonRow | None]
+    peak_negative: tuple[ComparisonRow | None, ComparisonRow | None]
+    residual: tuple[ComparisonRow | None, ComparisonRow | None]
+
+    def table(self) -> list[dict[str, Any]]:
+        """Return the rows of Table 2 that could be told, per quantity and axis."""
+        return [
+            {
+                "quantity": quantity,
+                "axis": axis,
+                "video_m": row.video_m,
+                "gps_m": row.gps_m,
+                "error_m": row.error_m,
+                "error_percent": row.error_percent,
+            }
+            for quantity in ("peak_positive", "peak_negative", "residual")
+            for axis, row in zip("xy", getattr(self, quantity), strict=True)
+            if row is not None
+        ]
+
+    def summary(self) -> dict[str, Any]:
+        """Return `gps` of `summary.json`."""
+        return {
+            "lag_s": self.lag_s,
+            "lag_sigma_s": self.lag_sigma_s,
+            "correlation": self.correlation,
+            "message": self.message,
+            "samples": len(self.time_s),
+            "rms_m": dict(zip("xy", self.rms_m.tolist(), strict=True)),
+            **{f"{name}_m": self._rows(name) for name in ("peak_positive", "peak_negative", "residual")},
+        }
+
+    def _rows(self, quantity: str) -> dict[str, Any]:
+        rows: tuple[ComparisonRow | None, ...] = getattr(self, quantity)
+        return {
+            axis: None
+            if row is None
+            else {"video": row.video_m, "gps": row.gps_m, "error": row.error_m, "error_percent": row.error_percent}
+            for axis, row in zip("xy", rows, strict=True)
+        }
+
+
+def read_gps(path: Path, settings: GpsInput) -> GpsRecord:
+    """Read a GPS record: text with a header line and one position a line.
+
+    Columns are separated by commas, semicolons or tabs; other columns, empty lines and lines that start with # are
+    passed over.
+
+    Raises:
+        InputError: names the file, and the missing column or the line at fault.
+    """
+    lines = _content_lines(path)
+    separator = max(",;\t", key=lines[0][1].count)
+    header = [name.strip() for name in next(csv.reader([lines[0][1]], delimiter=separator))]
+    columns = {key: getattr(settings, key) for key in ("time", "x", "y")}
+    for key, name in columns.items():
+        if name not in header:
+            found = ", ".join(f'"{column}"' for column in header)
+            raise InputError(
+                f'{path}: has no column "{name}" (found {found}); name the right one in inputs.gps.{key} of '
+                "project.json."
+            )
+    places = [header.index(name) for name in columns.values()]
+    rows = [_numbers(path, line, text, separator, places, header) for line, text in lines[1:]]
+    if len(rows) < 4:
+        raise InputError(f"{path}: has {len(rows)} positions; at least four are needed for a comparison.")
+    table = np.array(rows, dtype=np.float64)
+    backwards = np.flatnonzero(np.diff(table[:, 0]) <= 0)
+    if len(backwards):
+        line = lines[backwards[0] + 2][0]
+        raise InputError(
+            f'{path}: line {line}: "{columns["time"]}" is {table[backwards[0] + 1, 0]:g}, not after the line before '
+            f"({table[backwards[0], 0]:g}); sort the record and remove what is double."
+        )
+    return GpsRecord(path.name, read_only(table[:, 0]), read_only(table[:, 1:]))
+
+
+def _content_lines(path: Path) -> list[tuple[int, str]]:
+    """Return (line number, text) of the lines that carry something."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(
+            f"{path}: not found; correct inputs.gps.file of project.json or set inputs.gps to null."
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error}); export the GPS record as CSV.") from None
+    lines = [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not lines:
+        raise InputError(f"{path}: is empty; export the GPS record again as CSV with a header line.")
+    return lines
+
+
+def _numbers(
+    path: Path, line: int, text: str, separator: str, places: list[int], header: list[str]
+) -> tuple[float, ...]:
+    fields = next(csv.reader([text], delimiter=separator))
+    values = []
+    for place in places:
+        field = fields[place].strip() if place < len(fields) else ""
+        try:
+            value = float(field)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            what = f'"{field}", not a number' if field else "empty"
+            raise InputError(f'{path}: line {line}: "{header[place]}" is {what}; correct or remove the line.')
+        values.append(value)
+    return tuple(values)
+
+
+def compare_with_gps(
+    time_s: ArrayLike,
+    displacement_m: ArrayLike,
+    gps: GpsRecord,
+    intervals: Intervals,
+    *,
+    max_lag_s: float | None = None,
+) -> GpsComparison:
+    """Return how the video's displacement compares with GPS, after setting the GPS clock.
+
+    The lag is found where the two velocities correlate best (velocities know neither baseline nor slow drift), then
+    refined to the least RMS difference of the displacements, the video interpolated by cubic splines. The
+    GPS displacement is taken from its mean over the pre-event; without one, from the video's mean over all samples,
+    which is said.
+
+    Args:
+        time_s: (F,) of the frames.
+        displacement_m: (F, 2) at the antenna, from rest, NaN where not measured.
+        gps: the record.
+        intervals: of the project, in video time.
+        max_lag_s: largest difference of the clocks to consider; any where None.
+
+    Raises:
+        InputError: the video has no measured frames, or the two records share no time.
+    """
+    times = np.asarray(time_s, dtype=np.float64)
+    moved = np.asarray(displacement_m, dtype=np.float64)
+    video = _Video.of(times, moved)
+    lag_s, lag_sigma_s, correlation = _lag(video, gps, max_lag_s)
+    message = ""
+    if lag_sigma_s is None:
+        message = (
+            f"The clock lag of {gps.name} could not be told, because video and GPS show no motion in common "
+            f"(correlation {correlation:.2f}); the records are compared as if their clocks agreed."
+        )
+    shared = within(gps.time_s + lag_s, (float(video.times[0]), float(video.times[-1])))
+    sample_s, sample_m = gps.time_s[shared] + lag_s, gps.position_m[shared]
+    video_m = video.at(sample_s)
+    if not np.isfinite(video_m).any():
+        raise InputError(
+            f"{gps.name}: its times, {gps.time_s[0]:g} to {gps.time_s[-1]:g} s, share nothing with the measured video, "
+            f"{video.times[0]:g} to {video.times[-1]:g} s, and no common motion tells the clocks' difference; "
+            "give the record of this video, or set inputs.gps to null."
+        )
+    baseline_m, without_rest = _baseline(sample_s, sample_m, video_m, intervals)
+    sample_m = sample_m - baseline_m
+    error_m = video_m - sample_m
+    return GpsComparison(
+        lag_s=lag_s,
+        lag_sigma_s=lag_sigma_s,
+        correlation=correlation,
+        message=" ".join(sentence for sentence in (message, without_rest) if sentence),
+        time_s=read_only(sample_s),
+        gps_m=read_only(sample_m),
+        video_m=read_only(video_m),
+        error_m=read_only(error_m),
+        rms_m=read_only(np.sqrt(np.nanmean(error_m**2, axis=0))),
+        peak_positive=_peak_rows(times, moved, sample_s, sample_m, intervals, sign=1),
+        peak_negative=_peak_rows(times, moved, sample_s, sample_m, intervals, sign=-1),
+        residual=_residual_rows(times, moved, sample_s, sample_m, intervals),
+    )
+
+
+@dataclass(frozen=True)
+class _Video:
+    """Measured frames as a curve through time."""
+
+    times: Floats
+    moved: Floats
+    curve: CubicSpline
+    widest_bridge_s: float
+
+    @classmethod
+    def of(cls, times: Floats, moved: Floats) -> _Video:
+        measured = np.isfinite(moved).all(axis=1)
+        if measured.sum() < 4:
+            raise InputError(
+                f"The target was measured in {int(measured.sum())} frames; a comparison with GPS needs at least four."
+            )
+        step_s = float(np.median(np.diff(times)))
+        known_s, known_m = times[measured], moved[measured]
+        return cls(known_s, known_m, CubicSpline(known_s, known_m), _BRIDGED_FRAMES * step_s)
+
+    def at(self, time_s: Floats) -> Floats:
+        """(N, 2) displacement at any times; NaN outside the video and in its gaps."""
+        values = np.asarray(self.curve(time_s), dtype=np.float64)
+        after = np.searchsorted(self.times, time_s).clip(1, len(self.times) - 1)
+        in_gap = self.times[after] - self.times[after - 1] > self.widest_bridge_s
+        outside = (time_s < self.times[0]) | (time_s > self.times[-1])
+        # A sample on a frame is measured, whatever lies beside it.
+        on_frame = np.minimum(np.abs(self.times[after] - time_s), np.abs(self.times[after - 1] - time_s)) < 1e-6
+        values[(in_gap & ~on_frame) | outside] = np.nan
+        return values
+
+
+def _lag(video: _Video, gps: GpsRecord, max_lag_s: float | None) -> tuple[float, float | None, float]:
+    """Return the lag, its standard deviation (None where it could not be told), and the correlation there."""
+    lags_s, correlations = _correlations(video, gps)
+    if max_lag_s is not None:
+        considered = np.abs(lags_s) <= max_lag_s
+        lags_s, correlations = lags_s[considered], correlations[considered]
+    best = float(correlations.max(initial=-1.0))
+    if best < _LEAST_CORRELATION:
+        return 0.0, None, best
+    # Regular shaking correlates nearly as well a period earlier or later: every good peak is refined, the best kept.
+    higher = (correlations >= 0.9 * best) & _local_maxima(correlations)
+    coarse = np.flatnonzero(higher)[np.argsort(correlations[higher])[::-1][:5]]
+    step_s = float(lags_s[1] - lags_s[0]) if len(lags_s) > 1 else 0.1
+    refined = [_refined(video, gps, float(lags_s[place]), step_s) for place in coarse]
+    lag_s, sigma_s, _ = min(refined, key=lambda result: result[2])
+    return lag_s, sigma_s, best
+
+
+def _correlations(video: _Video, gps: GpsRecord) -> tuple[Floats, Floats]:
+    """Return (L,) lags and the correlation of the velocities at each, over all lags at which the records touch.
+
+    Each is measured against all of the video's motion, so that a short stretch that happens to fit does not win.
+    """
+    step_s = max(float(np.median(np.diff(video.times))), float(np.median(np.diff(gps.time_s))) / 2)
+    video_velocity = _velocity(video.times, video.moved, step_s)
+    gps_velocity = _velocity(gps.time_s, gps.position_m, step_s)
+    product_x, product_y = (correlate(video_velocity[:, axis], gps_velocity[:, axis], method="fft") for axis in (0, 1))
+    product = product_x + product_y
+    energy = correlate(np.ones(len(video_velocity)), np.sum(gps_velocity**2, axis=1), method="fft")
+    # What a quiet stretch of GPS would divide by is noise; a hundredth of the mean energy keeps it from counting.
+    energy = np.maximum(energy, 0.01 * np.sum(gps_velocity**2) * len(video_velocity) / len(gps_velocity))
+    scale = np.sqrt(np.sum(video_velocity**2) * energy)
+    shifts = np.arange(len(product)) - (len(gps_velocity) - 1)
+    correlations = np.divide(product, scale, out=np.zeros_like(scale), where=scale > 0)
+    return shifts * step_s + video.times[0] - gps.time_s[0], correlations
+
+
+def _velocity(times: Floats, positions: Floats, step_s: float) -> Floats:
+    """Return (M, 2) on an even grid from the first time on."""
+    grid_s = np.arange(times[0], times[-1] + step_s / 2, step_s)
+    even = np.stack([np.interp(grid_s, times, positions[:, axis]) for axis in (0, 1)], axis=1)
+    return np.asarray(np.gradient(even, step_s, axis=0), dtype=np.float64)
+
+
+def _local_maxima(values: Floats) -> Bools:
+    padded = np.concatenate([[-np.inf], values, [-np.inf]])
+    return np.asarray((values >= padded[:-2]) & (values >= padded[2:]), dtype=np.bool_)
+
+
+def _refined(video: _Video, gps: GpsRecord, coarse_s: float, step_s: float) -> tuple[float, float, float]:
+    """Return the lag of least RMS difference near a coarse one, its standard deviation, and that RMS."""
+    coarse_times = gps.time_s + coarse_s
+
+    # Measured from the coarse lag: clocks may differ by weeks, and the minimiser's tolerance grows with the number.
+    def rms(correction_s: float) -> float:
+        difference = video.at(coarse_times + correction_s) - gps.position_m
+        if np.isfinite(difference).sum() < 8:
+            return math.inf
+        return float(np.sqrt(np.nanmean((difference - np.nanmean(difference, axis=0)) ** 2)))
+
+    trials_s = np.linspace(-1.5 * step_s, 1.5 * step_s, 13)
+    start = int(np.argmin([rms(float(trial)) for trial in trials_s]))
+    bounds = float(trials_s[max(start - 1, 0)]), float(trials_s[min(start + 1, 12)])
+    found = minimize_scalar(rms, bounds=bounds, method="bounded", options={"xatol": 1e-6})
+    lag_s, least = coarse_s + float(found.x), float(found.fun)
+    velocity = np.asarray(video.curve(gps.time_s + lag_s, 1), dtype=np.float64)
+    velocity = velocity[np.isfinite(video.at(gps.time_s + lag_s)).all(axis=1)]
+    return lag_s, least / max(math.sqrt(float(np.sum(velocity**2))), 1e-12), least
+
+
+def _baseline(sample_s: Floats, sample_m: Floats, video_m: Floats, intervals: Intervals) -> tuple[Floats, str]:
+    """Return (2,) the GPS position that counts as rest, and a sentence where the pre-event could not give it."""
+    if intervals.pre_event is not None:
+        resting = within(sample_s, intervals.pre_event)
+        if resting.any():
+            return np.asarray(sample_m[resting].mean(axis=0), dtype=np.float64), ""
+    sentence = (
+        "No GPS sample lies in the pre-event interval, so the GPS baseline was taken from the video; "
+        "peaks and residuals are no independent check of it."
+    )
+    return np.asarray(np.nanmean(sample_m - video_m, axis=0), dtype=np.float64), sentence
+
+
+Rows = tuple[ComparisonRow | None, ComparisonRow | None]
+
+
+def _peak_rows(
+    times: Floats, moved: Floats, sample_s: Floats, sample_m: Floats, intervals: Intervals, *, sign: int
+) -> Rows:
+    """Return the extremes within the event, each record at its own rate as in the paper."""
+    window = intervals.event or (float(sample_s[0]), float(sample_s[-1]))
+
+    def extreme(values: Floats) -> float:
+        return sign * float(np.nanmax(sign * values))
+
+    return _rows(moved[within(times, window)], sample_m[within(sample_s, window)], extreme)
+
+
+def _residual_rows(times: Floats, moved: Floats, sample_s: Floats, sample_m: Floats, intervals: Intervals) -> Rows:
+    if intervals.residual is None:
+        return None, None
+    window = intervals.residual
+    return _rows(
+        moved[within(times, window)], sample_m[within(sample_s, window)], lambda values: float(np.nanmean(values))
+    )
+
+
+def _rows(video_m: Floats, gps_m: Floats, measure: Any) -> Rows:
+    if not np.isfinite(video_m).any() or not len(gps_m):
+        return None, None
+    x, y = (ComparisonRow(measure(video_m[:, axis]), measure(gps_m[:, axis])) for axis in (0, 1))
+    return x, y

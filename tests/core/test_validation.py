@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.coordinates import Floats
+from core.errors import InputError
+from core.project import GpsInput, Intervals
+from core.validation import GpsRecord, compare_with_gps, read_gps
+
+INTERVALS = Intervals(pre_event=(0.0, 9.0), event=(10.0, 24.0), residual=(27.0, 30.0))
+ORIGIN_M = np.array([477_000.0, 3_637_000.0])
+NOISE_M = 0.002
+
+
+def roof(time_s: Floats, residual_m: float = 0.22) -> Floats:
+    """Displacement of a roof: shaking between 10 and 24 s, ending away from where it began; mostly along x."""
+    envelope = np.clip(np.minimum(time_s - 10, 24 - time_s) / 4, 0, 1)
+    shaking = 0.3 * np.sin(2 * np.pi * 0.7 * time_s) + 0.15 * np.sin(2 * np.pi * 1.9 * time_s + 1)
+    offset = residual_m * np.clip((time_s - 16) / 3, 0, 1)
+    return np.column_stack([envelope * shaking + offset, 0.02 * envelope * np.cos(2 * np.pi * 1.3 * time_s)])
+
+
+def video(duration_s: float = 32.0) -> tuple[Floats, Floats]:
+    time_s = np.arange(round(duration_s * 30)) / 30
+    return time_s, roof(time_s)
+
+
+def gps_with_lag(lag_s: float, *, start_s: float = -3.0, end_s: float = 36.0, seed: int = 0) -> GpsRecord:
+    """A 10 Hz record of the same roof, whose clock shows video time less the lag."""
+    video_s = np.arange(start_s, end_s, 0.1)
+    noise = np.random.default_rng(seed).normal(scale=NOISE_M, size=(len(video_s), 2))
+    return GpsRecord("gps.csv", video_s - lag_s, ORIGIN_M + roof(video_s) + noise)
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.037, -1.234, 41.5, -302_417.66])
+def test_lag_is_found_to_a_fraction_of_a_sample(lag_s: float) -> None:
+    time_s, moved = video()
+    comparison = compare_with_gps(time_s, moved, gps_with_lag(lag_s), INTERVALS)
+    # Noise over root of the sum of squared velocities: 2 mm / 13 m/s = 0.15 ms; five of them.
+    assert comparison.lag_s == pytest.approx(lag_s, abs=8e-4)
+    assert comparison.lag_sigma_s is not None
+    assert 5e-5 < comparison.lag_sigma_s < 5e-4
+    assert comparison.message == ""
+    np.testing.assert_allclose(comparison.rms_m, NOISE_M, rtol=0.2)
+
+
+def test_lag_survives_drift_offset_and_lost_frames() -> None:
+    time_s, moved = video()
+    moved = moved + 0.05 * np.sin(2 * np.pi * 0.06 * time_s)[:, None] + 0.3
+    moved[300:345] = np.nan
+    comparison = compare_with_gps(time_s, moved, gps_with_lag(-7.77), INTERVALS)
+    assert comparison.lag_s == pytest.approx(-7.77, abs=0.02)
+    lost = (comparison.time_s > 10.0) & (comparison.time_s < 11.4)
+    assert np.isnan(comparison.video_m[lost]).all()
+    assert np.isfinite(comparison.video_m[~lost]).sum() > 500
+
+
+def test_rows_are_those_of_table_2() -> None:
+    time_s, moved = video()
+    scaled = moved * 0.95
+    comparison = compare_with_gps(time_s, scaled, gps_with_lag(3.0), INTERVALS)
+    peak = comparison.peak_positive[0]
+    assert peak is not None
+    event = (time_s >= 10) & (time_s <= 24)
+    assert peak.video_m == pytest.approx(scaled[event, 0].max())
+    # At 10 Hz, GPS may miss the peak by 0.05 s: a tenth of the amplitude of its quickest part.
+    assert peak.gps_m == pytest.approx(moved[event, 0].max(), abs=0.02)
+    assert peak.error_m == peak.video_m - peak.gps_m
+    assert peak.error_percent == pytest.approx(100 * abs(peak.error_m) / peak.gps_m)
+    residual = comparison.residual[0]
+    assert residual is not None
+    assert residual.video_m == pytest.approx(0.95 * 0.22, abs=1e-9)
+    assert residual.gps_m == pytest.approx(0.22, abs=0.002)
+    assert residual.error_percent == pytest.approx(5, abs=1)
+    assert {row["quantity"] for row in comparison.table()} == {"peak_positive", "peak_negative", "residual"}
+    assert comparison.summary()["lag_s"] == comparison.lag_s
+    assert comparison.summary()["residual_m"]["x"]["error"] == residual.error_m
+
+
+def test_without_residual_interval_there_is_no_residual_row() -> None:
+    time_s, moved = video()
+    comparison = compare_with_gps(time_s, moved, gps_with_lag(0.5), Intervals(pre_event=(0.0, 9.0)))
+    assert comparison.residual == (None, None)
+    assert comparison.summary()["residual_m"] == {"x": None, "y": None}
+
+
+def test_other_earthquakes_in_a_long_record_are_not_taken() -> None:
+    time_s, moved = video()
+    clock_s = np.arange(0, 1800, 0.1)
+    rng = np.random.default_rng(2)
+    position = roof(clock_s - 900.25) + rng.normal(scale=NOISE_M, size=(len(clock_s), 2))
+    other = np.exp(-(((clock_s - 300) / 6) ** 2)) * np.sin(2 * np.pi * 1.1 * clock_s)
+    position[:, 0] += other
+    comparison = compare_with_gps(time_s, moved, GpsRecord("gps.csv", clock_s, position), INTERVALS)
+    assert comparison.lag_s == pytest.approx(-900.25, abs=1e-3)
+
+
+def test_baseline_without_pre_event_is_said() -> None:
+    time_s, moved = video()
+    comparison = compare_with_gps(time_s, moved, gps_with_lag(0.0), Intervals())
+    assert "No GPS sample lies in the pre-event interval" in comparison.message
+    # Northings of millions of metres carry half a nanometre.
+    np.testing.assert_allclose(comparison.error_m.mean(axis=0), 0.0, atol=2e-9)
+
+
+def test_still_roof_tells_no_lag() -> None:
+    rng = np.random.default_rng(5)
+    time_s = np.arange(900) / 30
+    moved = rng.normal(scale=3e-4, size=(900, 2))
+    record = GpsRecord("gps.csv", np.arange(300) / 10, rng.normal(scale=NOISE_M, size=(300, 2)))
+    comparison = compare_with_gps(time_s, moved, record, INTERVALS)
+    assert comparison.lag_s == 0.0
+    assert comparison.lag_sigma_s is None
+    assert "clock lag of gps.csv could not be told" in comparison.message
+
+
+def test_refuses_records_that_share_no_time_or_nothing_measured() -> None:
+    rng = np.random.default_rng(5)
+    time_s = np.arange(900) / 30
+    record = GpsRecord("gps.csv", 5000 + np.arange(300) / 10, rng.normal(scale=NOISE_M, size=(300, 2)))
+    with pytest.raises(InputError, match=r"gps\.csv: its times, 5000 to 5029\.9 s, share nothing with the measured"):
+        compare_with_gps(time_s, rng.normal(scale=3e-4, size=(900, 2)), record, INTERVALS)
+    with pytest.raises(InputError, match="measured in 0 frames; a comparison with GPS needs at least four"):
+        compare_with_gps(time_s, np.full((900, 2), np.nan), record, INTERVALS)
+
+
+def test_largest_lag_is_respected() -> None:
+    time_s, moved = video()
+    comparison = compare_with_gps(time_s, moved, gps_with_lag(9.0), INTERVALS, max_lag_s=2.0)
+    assert abs(comparison.lag_s) <= 2.0
+
+
+def write(folder: Path, text: str) -> Path:
+    file = folder / "gps.csv"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def settings(**names: str) -> GpsInput:
+    return GpsInput(file="gps.csv", **names)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_reads_named_columns_and_passes_over_the_rest(tmp_path: Path, separator: str) -> None:
+    rows = ["\ufeff# station CENT", "time_s,up_m,north_m,east_m", "0.0,9,2.5,1.5", "", "0.1,9,2.6,1.6", "0.2,x,2.7,1.7"]
+    file = write(tmp_path, "\n".join([*rows, "0.3,9,2.8,1.8"]).replace(",", separator) + "\n")
+    record = read_gps(file, settings())
+    np.testing.assert_allclose(record.time_s, [0, 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(record.position_m, [[1.5, 2.5], [1.6, 2.6], [1.7, 2.7], [1.8, 2.8]])
+    assert not record.position_m.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("t,e,n\n0,1,2\n", r'gps\.csv: has no column "time_s" \(found "t", "e", "n"\).*inputs\.gps\.time'),
+        ("time_s,east_m,north_m\n0,1,2\n0.1,oops,2\n", r'line 3: "east_m" is "oops", not a number; correct or remove'),
+        ("time_s,east_m,north_m\n0,1,2\n0.1,1\n", r'line 3: "north_m" is empty'),
+        ("time_s,east_m,north_m\n0,1,2\n0.1,1,nan\n", r'line 3: "north_m" is "nan", not a number'),
+        ("time_s,east_m,north_m\n0,1,2\n1,1,2\n", r"has 2 positions; at least four"),
+        (
+            "time_s,east_m,north_m\n0,1,2\n2,1,2\n\n1,1,2\n3,1,2\n",
+            r'line 5: "time_s" is 1, not after the line before \(2\)',
+        ),
+        ("", r"is empty"),
+    ],
+)
+def test_bad_records_are_refused_by_line(tmp_path: Path, body: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_gps(write(tmp_path, body), settings())
+
+
+def test_missing_and_binary_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"not found; correct inputs\.gps\.file"):
+        read_gps(tmp_path / "none.csv", settings())
+    (tmp_path / "gps.csv").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(InputError, match="cannot be read as text"):
+        read_gps(tmp_path / "gps.csv", settings())
