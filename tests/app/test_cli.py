@@ -1,0 +1,260 @@
+"""The program's commands, its exit codes, and one sentence for every mistake."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.cli import main
+from core.errors import InputError
+from core.project import read_project
+from tests import small_project
+
+Run = Callable[..., None]
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("inputs")
+    small_project.write_inputs(folder)
+    return folder
+
+
+@pytest.fixture
+def engine(monkeypatch: pytest.MonkeyPatch) -> Callable[[Run], list[dict[str, Any]]]:
+    """Put another engine in the place of the real one; return the list of what it was asked to do."""
+
+    def install(run: Run) -> list[dict[str, Any]]:
+        asked: list[dict[str, Any]] = []
+
+        def run_project(folder: Path, **options: Any) -> None:
+            asked.append({"folder": folder, **options})
+            run(folder, **options)
+
+        monkeypatch.setitem(sys.modules, "core.run", types.SimpleNamespace(run_project=run_project))
+        return asked
+
+    return install
+
+
+def project_at(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    small_project.write_document(folder, small_project.document())
+    return folder
+
+
+def one_sentence(text: str) -> str:
+    assert len(text.strip().splitlines()) == 1, text
+    assert text.startswith("rooftrack: ")
+    assert text.rstrip().endswith(".")
+    assert "Traceback" not in text
+    return text
+
+
+# run
+
+
+def test_run_hands_everything_to_the_engine(tmp_path: Path, engine: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    def run(folder: Path, *, progress: Any, **rest: Any) -> None:
+        progress("measure", 3, 3)
+
+    asked = engine(run)
+    project = project_at(tmp_path / "eq7")
+    assert main(["run", str(project), "--workers", "2", "--scheduler", "tcp://127.0.0.1:1", "--fresh"]) == 0
+    (order,) = asked
+    assert order["folder"] == project
+    assert (order["workers"], order["scheduler"], order["fresh"]) == (2, "tcp://127.0.0.1:1", True)
+    out, err = capsys.readouterr()
+    assert "measure" in out
+    assert str(project / "results") in out
+    assert err == ""
+
+
+def test_run_queues_folders_and_the_projects_of_a_workspace(tmp_path: Path, engine: Any) -> None:
+    asked = engine(lambda folder, **rest: None)
+    single = project_at(tmp_path / "single")
+    for name in ("b", "a", ".trash"):
+        project_at(tmp_path / "workspace" / name)
+    assert main(["run", str(single), str(tmp_path / "workspace"), str(single)]) == 0
+    assert [order["folder"].name for order in asked] == ["single", "a", "b"]
+
+
+def test_run_goes_on_after_a_project_that_cannot_be_measured(
+    tmp_path: Path, engine: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(folder: Path, **rest: Any) -> None:
+        if folder.name == "a":
+            raise InputError(f"{folder}: has no video;\nadd one.")
+
+    asked = engine(run)
+    for name in ("a", "b"):
+        project_at(tmp_path / name)
+    assert main(["run", str(tmp_path)]) == 1
+    assert [order["folder"].name for order in asked] == ["a", "b"]
+    assert one_sentence(capsys.readouterr().err).endswith("a: has no video; add one.\n")
+
+
+def test_ctrl_c_keeps_what_is_measured(tmp_path: Path, engine: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    def run(folder: Path, *, cancel: Any, **rest: Any) -> None:
+        assert not cancel.cancelled
+        signal.raise_signal(signal.SIGINT)
+        cancel.raise_if_cancelled()
+
+    asked = engine(run)
+    for name in ("a", "b"):
+        project_at(tmp_path / name)
+    before = signal.getsignal(signal.SIGINT)
+    assert main(["run", str(tmp_path)]) == 130
+    assert len(asked) == 1
+    assert "partial results kept" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_second_ctrl_c_stops_at_once(tmp_path: Path, engine: Any) -> None:
+    def run(folder: Path, **rest: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("still running")
+
+    engine(run)
+    assert main(["run", str(project_at(tmp_path / "eq7"))]) == 130
+
+
+def test_an_unexpected_error_is_kept_in_a_file(
+    tmp_path: Path, engine: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(folder: Path, **rest: Any) -> None:
+        raise ZeroDivisionError("a mistake of ours")
+
+    engine(run)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert main(["run", str(project_at(tmp_path / "eq7"))]) == 1
+    assert "a mistake of ours" in one_sentence(capsys.readouterr().err)
+    (account,) = tmp_path.glob("rooftrack-error-*.txt")
+    assert "Traceback" in account.read_text(encoding="utf-8")
+
+
+def test_a_full_disk_is_told(tmp_path: Path, engine: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    def run(folder: Path, **rest: Any) -> None:
+        raise OSError(28, "No space left on device", "frames.sqlite")
+
+    engine(run)
+    assert main(["run", str(project_at(tmp_path / "eq7"))]) == 1
+    assert "frames.sqlite: No space left on device" in one_sentence(capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["fly"],
+        ["run"],
+        ["run", "nowhere"],
+        ["run", ".", "--workers", "0"],
+        ["run", ".", "--workers", "two"],
+        ["check", "nowhere"],
+        ["new", "eq7"],
+        ["lens", "a.jpg", "--board", "9", "--square-m", "0.025", "--out", "lens.yaml"],
+        ["lens", "a.jpg", "--board", "9x6", "--square-m", "-1", "--out", "lens.yaml"],
+        ["serve", "nowhere"],
+        ["serve", ".", "--port", "99999"],
+    ],
+)
+def test_a_mistake_in_the_command_gets_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 1
+    one_sentence(capsys.readouterr().err)
+
+
+# check
+
+
+def test_check_of_a_sound_project(inputs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small_project.write_document(inputs, small_project.document())
+    assert main(["check", str(inputs)]) == 0
+    assert "ready to run" in capsys.readouterr().out
+
+
+def test_check_says_each_problem_in_a_line(inputs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = small_project.document()
+    document["targets"] = []
+    document["reference_frame"] = 1000
+    small_project.write_document(inputs, document)
+    assert main(["check", str(inputs)]) == 1
+    out, err = capsys.readouterr()
+    assert len(out.splitlines()) == 2
+    one_sentence(err)
+
+
+# new
+
+
+def test_new_refers_to_inputs_from_its_folder(inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "campaign" / "eq7"
+    files = {
+        name: inputs / file for name, file in {"video": "video.mp4", "cloud": "site.csv", "gps": "gps.csv"}.items()
+    }
+    arguments = [part for name, file in files.items() for part in (f"--{name}", str(file))]
+    assert main(["new", str(folder), *arguments, "--lens", str(inputs / "lens.yaml")]) == 0
+    project = read_project(folder)
+    assert project.name == "eq7"
+    assert project.inputs.gps is not None
+    assert not Path(project.inputs.video).is_absolute()
+    assert (folder / project.inputs.video).resolve() == files["video"].resolve()
+    assert (folder / project.inputs.gps.file).resolve() == files["gps"].resolve()
+    assert [file.name for file in folder.iterdir()] == ["project.json"]
+    assert "eq7" in capsys.readouterr().out
+
+
+def test_new_leaves_an_existing_project_as_it_is(
+    inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = project_at(tmp_path / "eq7")
+    before = (folder / "project.json").read_bytes()
+    assert main(["new", str(folder), "--video", str(inputs / "video.mp4")]) == 1
+    assert "exists already" in one_sentence(capsys.readouterr().err)
+    assert (folder / "project.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--video", "gone.mp4"], "gone.mp4: there is no such file"),
+        (["--video", "gps.csv"], "gps.csv: cannot be opened as a video"),
+        (["--video", "video.mp4", "--cloud", "gone.laz"], "gone.laz: there is no such file"),
+        (["--video", "video.mp4", "--lens", "gps.csv"], "gps.csv: is not an OpenCV FileStorage file"),
+    ],
+)
+def test_new_refuses_what_cannot_be_used(
+    inputs: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    told: str,
+) -> None:
+    monkeypatch.chdir(inputs)
+    assert main(["new", str(tmp_path / "eq7"), *arguments]) == 1
+    assert told in one_sentence(capsys.readouterr().err)
+    assert not (tmp_path / "eq7").exists()
+
+
+# the program itself
+
+
+def test_help_and_version_answer_without_loading_the_engine() -> None:
+    source = "import sys, app.cli; print(*({'cv2', 'scipy', 'av', 'open3d', 'viser'} & set(sys.modules)))"
+    loaded = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=True)
+    assert loaded.stdout.split() == []
+    shown = subprocess.run([sys.executable, "-m", "app.cli", "--help"], capture_output=True, text=True, check=True)
+    for command in ("run", "check", "new", "lens", "serve"):
+        assert f"\n    {command} " in shown.stdout

@@ -1,0 +1,131 @@
+"""Whatever contradicts itself is told before hours are spent, one line each with what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from core.check import check_project
+from core.lens import Lens, write_lens
+from tests import small_project
+
+Change = Callable[[dict[str, Any]], object]
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("project")
+    small_project.write_inputs(folder)
+    return folder
+
+
+def problems(folder: Path, change: Change) -> list[str]:
+    document = small_project.document()
+    change(document)
+    small_project.write_document(folder, document)
+    return check_project(folder)
+
+
+def put(value: Any, *path: str | int) -> Change:
+    """Return a change that puts a value at a place of the document."""
+
+    def change(document: Any) -> None:
+        for key in path[:-1]:
+            document = document[key]
+        document[path[-1]] = value
+
+    return change
+
+
+def test_a_sound_project_has_no_problems(inputs: Path) -> None:
+    assert problems(inputs, lambda document: None) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (put("gone.mp4", "inputs", "video"), "gone.mp4: not found"),
+        (put("gps.csv", "inputs", "video"), "gps.csv: cannot be opened as a video"),
+        (put("gone.yaml", "inputs", "lens"), "gone.yaml: not found"),
+        (put("gps.csv", "inputs", "lens"), "gps.csv: is not an OpenCV FileStorage file"),
+        (put(None, "inputs", "lens"), 'inputs.lens: missing, but method "geometric" needs it'),
+        (put("gone.laz", "inputs", "cloud"), "gone.laz: not found"),
+        (put(90, "reference_frame"), "reference_frame: is 90, but the video ends with frame 39"),
+        (put([[30, 45]], "excluded_frames"), "excluded_frames[0]: [30, 45] ends after the last frame, 39"),
+        (put([], "correspondences"), "correspondences: 0 enabled"),
+        (put(False, "correspondences", 0, "enabled"), None),
+        (put([200, 10], "correspondences", 0, "frame_px"), "id 1: frame_px [200, 10] is outside the 160 x 120 frame"),
+        (put([50, 0], "correspondences", 4, "ground_m"), "id 5: ground_m [50, 0] lies outside the point cloud"),
+        (put([], "moving_regions_px"), "moving_regions_px: none"),
+        (put([[[200, 0], [210, 0], [210, 9]]], "moving_regions_px"), "moving_regions_px[0]: lies wholly outside"),
+        (put([], "targets"), "targets: none"),
+        (put(None, "targets", 0, "height_m"), 'targets[0].height_m: missing, but method "geometric" needs'),
+        (put([-8, -8, 8, 1], "orthoimage", "extent_m"), "targets[0].lines.T1.to_m: [0, 2] lies outside orthoimage"),
+        (put([2, -0.2], "targets", 0, "lines", "T1", "from_m"), None),
+        (put([-2, 1.9], "targets", 0, "lines", "T1", "from_m"), "L1 and T1 run nearly the same way"),
+        (put([1.0, 5.0], "intervals_s", "residual"), "intervals_s.residual: [1, 5] reaches outside the video"),
+        (put([0.51, 0.54], "intervals_s", "pre_event"), "intervals_s.pre_event: [0.51, 0.54] holds no frame"),
+        (put({"filter": "high-pass", "corner_hz": 10}, "drift"), "drift.corner_hz: 10 is not below 10 Hz"),
+        (put(3, "wind"), 'wind: unknown key "wind"'),
+    ],
+)
+def test_each_contradiction_is_told_in_one_line(inputs: Path, change: Change, told: str | None) -> None:
+    found = problems(inputs, lambda document: (document.setdefault("orthoimage", {}), change(document)))
+    if told is None:
+        assert found == []
+        return
+    assert any(told in line for line in found), found
+    assert all("\n" not in line and line.endswith(".") for line in found)
+
+
+def test_all_problems_are_told_at_once(inputs: Path) -> None:
+    def change(document: dict[str, Any]) -> None:
+        document["reference_frame"] = 90
+        document["targets"] = []
+        document["inputs"]["lens"] = "gone.yaml"
+
+    assert len(problems(inputs, change)) == 3
+
+
+def test_lens_of_another_image_size(inputs: Path) -> None:
+    write_lens(inputs / "other.yaml", Lens.ideal((320, 240), 300.0))
+    (line,) = problems(inputs, put("other.yaml", "inputs", "lens"))
+    assert "320 x 240" in line
+    assert "160 x 120" in line
+
+
+def test_l1_and_l2_in_the_same_place(inputs: Path) -> None:
+    band = small_project.document()["targets"][0]["lines"]["L1"]
+    (line,) = problems(inputs, put(band, "targets", 0, "lines", "L2"))
+    assert "L1 and L2 cross T1 in the same place" in line
+
+
+def test_paper_needs_neither_lens_nor_height(inputs: Path) -> None:
+    def change(document: dict[str, Any]) -> None:
+        document["method"] = "paper"
+        document["inputs"]["lens"] = None
+        document["targets"][0]["height_m"] = None
+
+    assert problems(inputs, change) == []
+
+
+@pytest.mark.parametrize(("text", "told"), [("{", "line 1, column 2 is not valid JSON"), ("[]", "project.json: top:")])
+def test_a_file_that_is_no_project(tmp_path: Path, text: str, told: str) -> None:
+    (tmp_path / "project.json").write_text(text, encoding="utf-8")
+    (line,) = check_project(tmp_path)
+    assert told in line
+
+
+def test_a_folder_without_project(tmp_path: Path) -> None:
+    (line,) = check_project(tmp_path)
+    assert "project.json: not found; make a project with `rooftrack new" in line
+
+
+def test_nothing_is_written(inputs: Path) -> None:
+    problems(inputs, lambda document: None)
+    before = sorted((file.name, file.stat().st_mtime_ns) for file in inputs.iterdir())
+    check_project(inputs)
+    assert sorted((file.name, file.stat().st_mtime_ns) for file in inputs.iterdir()) == before
