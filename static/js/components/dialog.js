@@ -1,0 +1,61 @@
+// Modal dialogs on the browser's own <dialog>: focus stays inside, Escape closes, focus returns.
+
+import { h } from "../lib/dom.js";
+import { icon } from "../lib/icons.js";
+
+/** @typedef {import("../lib/dom.js").Child} Child */
+
+/**
+ * Open a dialog. The promise resolves when it is closed, with what `close` was given (null for Escape or Cancel).
+ * @template Result
+ * @param {object} options
+ * @param {string} options.title
+ * @param {(close: (result: Result | null) => void) => Child[]} options.body
+ * @param {string} [options.size]  "small", "wide", "tall"
+ * @returns {Promise<Result | null>}
+ */
+export function openDialog({ title, body, size = "" }) {
+  return new Promise((resolve) => {
+    const dialog = h("dialog", { class: `dialog ${size}`, "aria-labelledby": "dialog-title" });
+    const close = (/** @type {Result | null} */ result) => {
+      dialog.close();
+      dialog.remove();
+      resolve(result);
+    };
+    const dismiss = h("button", { class: "button quiet icon-only", type: "button", "aria-label": "Close", onclick: () => close(null) }, icon("close"));
+    dialog.append(h("header", {}, h("h2", { id: "dialog-title" }, title), dismiss), ...body(close).filter((child) => child instanceof Node));
+    dialog.addEventListener("cancel", (event) => (event.preventDefault(), close(null)));
+    dialog.addEventListener("pointerdown", (event) => event.target === dialog && close(null));
+    document.body.append(dialog);
+    dialog.showModal();
+    const first = dialog.querySelector("[autofocus], .dialog-body input, .dialog-body select, .dialog-body button");
+    if (first instanceof HTMLElement) first.focus();
+    if (first instanceof HTMLInputElement && first.type === "text") first.select();
+  });
+}
+
+/**
+ * Ask for one line of text.
+ * @param {{title: string, label: string, value?: string, action: string, hint?: string}} options
+ * @returns {Promise<string | null>}
+ */
+export function askText({ title, label, value = "", action, hint }) {
+  return openDialog({
+    title,
+    size: "small",
+    body: (close) => {
+      const input = h("input", { class: "input", type: "text", id: "ask-text", value, required: true, autocomplete: "off", spellcheck: "false" });
+      const submit = (/** @type {Event} */ event) => {
+        event.preventDefault();
+        if (input.value.trim() !== "") close(input.value.trim());
+      };
+      const field = h("div", { class: "field" }, h("label", { class: "label", for: "ask-text" }, label), input, hint && h("p", { class: "hint" }, hint));
+      return [h("form", { class: "dialog-form", onsubmit: submit }, h("div", { class: "dialog-body" }, field), dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, action)))];
+    },
+  });
+}
+
+/** Foot of a dialog: Cancel, then what it is for. @param {() => void} cancel @param {...HTMLElement} actions */
+export function dialogActions(cancel, ...actions) {
+  return h("footer", {}, h("button", { class: "button", type: "button", onclick: cancel }, "Cancel"), ...actions);
+}

@@ -1,0 +1,124 @@
+// The bar on top of every page: the eight steps with their status, saving, undo, theme, help.
+
+import { fill, find, h, svg } from "../lib/dom.js";
+import { icon } from "../lib/icons.js";
+import { bindKeys } from "../lib/keys.js";
+import { nextTheme, themeIcon } from "../lib/theme.js";
+import { openHelp } from "./help.js";
+import { toastError } from "./toast.js";
+
+/** @typedef {import("../lib/types.js").StepName} StepName */
+/** @typedef {import("../lib/types.js").StepStatus} StepStatus */
+/** @typedef {import("../lib/store.js").ProjectStore} ProjectStore */
+
+/** @type {readonly {step: StepName, name: string}[]} */
+export const STEPS = [
+  { step: "inputs", name: "Inputs" },
+  { step: "orthoimage", name: "Orthoimage & 3D" },
+  { step: "correspondences", name: "Correspondences" },
+  { step: "regions", name: "Regions" },
+  { step: "track", name: "Track" },
+  { step: "review", name: "Review" },
+  { step: "drift", name: "Drift" },
+  { step: "export", name: "Export" },
+];
+
+const STATUS_ICONS = /** @type {const} */ ({ done: "check", warn: "warn", error: "close", stale: "stale", running: "running" });
+const STATUS_WORDS = { todo: "to do", done: "done", warn: "done, with a warning", error: "needs attention", stale: "out of date", running: "running" };
+
+/** Header of a page outside any project. @param {...Node} actions */
+export function projectsHeader(...actions) {
+  fill(find("#header"), brand(), h("span", { class: "steps" }), h("div", { class: "header-actions" }, ...actions, themeButton(), helpButton("Projects")));
+  bindKeys([helpKey("Projects")]);
+}
+
+/** @param {ProjectStore} store @param {StepName} step */
+export function projectHeader(store, step) {
+  const title = STEPS.find((entry) => entry.step === step)?.name ?? "";
+  const name = h("span", { class: "project-name" });
+  const steps = h("nav", { class: "steps", "aria-label": "Steps" });
+  const saved = h("span", { class: "save-state", role: "status" });
+  const undo = actionButton("undo", "Undo", () => store.undo().catch(toastError));
+  const redo = actionButton("redo", "Redo", () => store.redo().catch(toastError));
+  fill(find("#header"), brand(), name, steps, h("div", { class: "header-actions" }, saved, undo, redo, themeButton(), helpButton(title)));
+
+  const show = () => {
+    const { state } = store;
+    name.textContent = store.project.name;
+    name.title = store.project.name;
+    document.title = `${title} · ${store.project.name} · Rooftrack`;
+    fill(steps, STEPS.map((entry, i) => stepLink(state.id, entry, i + 1, state.steps?.[entry.step], entry.step === step)));
+    setAction(undo, state.can_undo, `Undo${state.undo_label ? `: ${state.undo_label}` : ""} (Ctrl+Z)`);
+    setAction(redo, state.can_redo, `Redo${state.redo_label ? `: ${state.redo_label}` : ""} (Ctrl+Shift+Z)`);
+  };
+  store.on("change", show);
+  store.on("saving", (state) => showSaving(saved, state));
+  show();
+  showSaving(saved, "saved");
+  bindKeys([helpKey(title), ...STEPS.map((entry, i) => ({ keys: `Alt+${i + 1}`, group: "Everywhere", label: entry.name, run: () => location.assign(stepUrl(store.id, entry.step)) }))]);
+}
+
+/** @param {string} id @param {StepName} step */
+export const stepUrl = (id, step) => `/p/${encodeURIComponent(id)}/${step}`;
+
+/** Round mark of a step's status: glyph and colour. @param {StepStatus} status @param {number | string} number shown while to do */
+export function statusMark(status, number = "") {
+  return h("span", { class: `status ${status}` }, status === "todo" ? number : icon(STATUS_ICONS[status]));
+}
+
+/** @param {string} id @param {{step: StepName, name: string}} entry @param {number} number @param {{status: StepStatus, message: string} | undefined} state @param {boolean} current */
+function stepLink(id, entry, number, state, current) {
+  const status = state?.status ?? "todo";
+  const words = `${entry.name}: ${STATUS_WORDS[status]}${state?.message ? `. ${state.message}` : ""}`;
+  return h(
+    "a",
+    { href: stepUrl(id, entry.step), "aria-current": current ? "page" : null, title: words, "data-step": entry.step, "data-status": status },
+    statusMark(status, number),
+    h("span", { class: "name" }, entry.name),
+    h("span", { class: "visually-hidden" }, `, ${STATUS_WORDS[status]}`),
+  );
+}
+
+function brand() {
+  const logo = svg(
+    "svg",
+    { viewBox: "0 0 24 24", "aria-hidden": "true" },
+    svg("rect", { x: 1, y: 1, width: 22, height: 22, rx: 6, fill: "#0a5fb4" }),
+    svg("path", { d: "M6 15.500 12 7l6 8.500", fill: "none", stroke: "#fff", "stroke-width": 2, "stroke-linecap": "round", "stroke-linejoin": "round" }),
+    svg("circle", { cx: 12, cy: 15, r: 2.2, fill: "#ffd23f" }),
+  );
+  return h("a", { class: "brand", href: "/", title: "All projects" }, logo, "Rooftrack");
+}
+
+/** @param {"undo" | "redo"} name @param {string} label @param {() => void} run */
+const actionButton = (name, label, run) => h("button", { class: "button quiet icon-only", type: "button", "aria-label": label, onclick: run }, icon(name));
+
+/** @param {HTMLButtonElement} button @param {boolean} enabled @param {string} words */
+function setAction(button, enabled, words) {
+  button.disabled = !enabled;
+  button.title = words;
+  button.setAttribute("aria-label", words);
+}
+
+/** @param {HTMLElement} element @param {"saved" | "saving" | "failed"} state */
+function showSaving(element, state) {
+  const words = { saved: "Saved", saving: "Saving…", failed: "Not saved" }[state];
+  element.className = `save-state ${state === "failed" ? "bad" : ""}`;
+  element.dataset.state = state;
+  fill(element, icon(state === "saved" ? "check" : state === "saving" ? "running" : "warn", "small"), h("span", { class: "word" }, words));
+}
+
+function themeButton() {
+  const button = h("button", { class: "button quiet icon-only", type: "button", "aria-label": "Light or dark", title: "Light or dark" }, icon(themeIcon()));
+  button.addEventListener("click", () => {
+    nextTheme();
+    fill(button, icon(themeIcon()));
+  });
+  return button;
+}
+
+/** @param {string} title */
+const helpButton = (title) => h("button", { class: "button quiet icon-only", type: "button", "aria-label": "Keys and gestures (?)", title: "Keys and gestures (?)", onclick: () => openHelp(title) }, icon("help"));
+
+/** @param {string} title @returns {import("../lib/keys.js").KeyBinding} */
+const helpKey = (title) => ({ keys: "?", group: "Everywhere", label: "This list", run: () => openHelp(title) });

@@ -1,0 +1,71 @@
+// How to write a page (read this first).
+//
+// - `static/<step>.html` is a skeleton with landmarks: <header id="header">, <main id="main">; it links css/main.css,
+//   js/theme-first.js and one module, js/pages/<step>.js. The server's content security policy allows no inline
+//   script, no <style> and no style="" in markup; `element.style.x = …` and SVG attributes are fine.
+// - A page module starts with `const page = await openPage("track");` and gets
+//     page.id      the project's id                     page.store   the project with revisions and undo (lib/store.js)
+//     page.events  what the server tells on its own     page.keys    bindKeys: bound and listed under `?`
+//   Change the project only with `store.edit("Move pair 3", (draft) => { … })`; redraw on `store.on("change", …)`.
+// - Ask the server through lib/api.js, catch with `toastError`. Results (fits, transforms, residuals) come from there:
+//   the browser never computes one. Only lib/coordinates.js knows canvas px and the half-pixel rule.
+// - What one looks at (selection, view, tab) goes to the query string with lib/view-state.js.
+// - Elements come from `h("button", { class: "button", onclick: … }, "Text")`; icons from lib/icons.js;
+//   numbers for people from lib/format.js.
+// - Imports run lib → components → pages. Files are named with hyphens, exports in camelCase.
+
+import { ProjectStore } from "../lib/store.js";
+import { ServerEventStream } from "../lib/events.js";
+import { bindKeys } from "../lib/keys.js";
+import { fill, find, h } from "../lib/dom.js";
+import { sentence } from "../lib/api.js";
+import { projectHeader, STEPS } from "./header.js";
+import { toast, toastError } from "./toast.js";
+
+/** @typedef {import("../lib/types.js").StepName} StepName */
+/** @typedef {{id: string, step: StepName, store: ProjectStore, events: ServerEventStream, keys: typeof bindKeys}} Page */
+
+/** Open the project named in the URL, fill the header, bind undo. @param {StepName} step @returns {Promise<Page>} */
+export async function openPage(step) {
+  const id = decodeURIComponent(location.pathname.split("/")[2] ?? "");
+  try {
+    const store = await ProjectStore.open(id);
+    const events = new ServerEventStream(id);
+    projectHeader(store, step);
+    tellTroubles(store);
+    events.on("hello", ({ revision }) => store.heardOf(revision));
+    events.on("project", ({ revision }) => store.heardOf(revision));
+    for (const name of /** @type {const} */ (["inputs", "orthoimage", "results"])) events.on(name, () => void store.refresh().catch(toastError));
+    bindKeys(historyKeys(store));
+    return { id, step, store, events, keys: bindKeys };
+  } catch (error) {
+    showDeadEnd(sentence(error));
+    throw error;
+  }
+}
+
+/** The step after this one, for a button at the end of a page. @param {StepName} step */
+export const nextStep = (step) => STEPS[STEPS.findIndex((entry) => entry.step === step) + 1] ?? null;
+
+/** @param {ProjectStore} store @returns {import("../lib/keys.js").KeyBinding[]} */
+function historyKeys(store) {
+  return [
+    { keys: "Ctrl+Z", group: "Everywhere", label: "Undo", run: () => store.undo().catch(toastError), when: () => store.state.can_undo },
+    { keys: "Ctrl+Shift+Z / Ctrl+Y", group: "Everywhere", label: "Redo", run: () => store.redo().catch(toastError), when: () => store.state.can_redo },
+  ];
+}
+
+/** @param {ProjectStore} store */
+function tellTroubles(store) {
+  store.on("conflict", ({ label, again }) =>
+    toast(`“${label}” was not saved: another window has changed this project. You now see its newer state.`, { tone: "warn", seconds: 0, action: { label: "Do it again", run: again } }),
+  );
+  store.on("refused", ({ label, error }) => toast(`“${label}” was not saved. ${sentence(error)}`, { tone: "bad" }));
+}
+
+/** @param {string} message */
+function showDeadEnd(message) {
+  fill(find("#header"), h("a", { class: "brand", href: "/" }, "Rooftrack"));
+  const box = h("div", { class: "empty-state" }, h("h1", {}, "This project cannot be opened"), h("p", {}, message), h("a", { class: "button primary", href: "/" }, "All projects"));
+  fill(find("#main"), h("div", { class: "page" }, box));
+}

@@ -1,0 +1,117 @@
+// Marks, lines, bands and polygons drawn over a picture, given in image px and kept in SVG by id.
+
+import { decorate, svg } from "../lib/dom.js";
+import { distance, distanceToSegment, isInside } from "../lib/coordinates.js";
+
+/** @typedef {import("../lib/types.js").Point} Point */
+/** @typedef {import("../lib/coordinates.js").View} View */
+
+/**
+ * @typedef {object} Shape
+ * @property {string} id  unique in its pane
+ * @property {"mark" | "handle" | "polygon" | "polyline" | "arrow"} kind
+ * @property {Point[]} points  image px; a mark or handle has one, an arrow two (tail, head)
+ * @property {string} [class]  "selected", "off", "ghost", "pending", "moving", "l1", "l2", "t1", "corner-point", "dashed", "thin", "empty"
+ * @property {string} [label]  drawn beside a mark, or at the first point of a line
+ * @property {boolean} [grab]  can be selected and dragged; polygons also by their inside
+ */
+
+const GRAB_RADIUS = { mark: 14, handle: 13, arrow: 0, polyline: 8, polygon: 7 };
+const MARK = "M-11 0H-3.500M3.500 0H11M0-11V-3.500M0 3.500V11M6.500 0a6.500 6.500 0 1 1-13 0 6.500 6.500 0 1 1 13 0";
+const HANDLE = "M4.500 0a4.500 4.500 0 1 1-9 0 4.500 4.500 0 1 1 9 0";
+const HANDLE_CORE = "M2.500 0a2.500 2.500 0 1 1-5 0 2.500 2.500 0 1 1 5 0";
+
+/** The SVG elements of a pane's shapes, made once per id and moved afterwards. */
+export class ShapeLayer {
+  /** @type {Map<string, {group: SVGGElement, halo: SVGPathElement, ink: SVGPathElement, text: SVGTextElement}>} */
+  #drawn = new Map();
+
+  constructor() {
+    this.element = svg("svg", { class: "shapes", "aria-hidden": "true" });
+  }
+
+  /** @param {Shape[]} shapes @param {View} view @param {string | null} hot id under the pointer */
+  draw(shapes, view, hot) {
+    const gone = new Set(this.#drawn.keys());
+    for (const shape of shapes) {
+      gone.delete(shape.id);
+      this.#place(shape, view, shape.id === hot);
+    }
+    for (const id of gone) {
+      this.#drawn.get(id)?.group.remove();
+      this.#drawn.delete(id);
+    }
+  }
+
+  /** @param {string} id */
+  #parts(id) {
+    let parts = this.#drawn.get(id);
+    if (parts === undefined) {
+      const halo = svg("path", { class: "halo" });
+      const ink = svg("path", { class: "ink" });
+      const text = svg("text");
+      const group = svg("g", { "data-id": id }, halo, ink, text);
+      parts = { group, halo, ink, text };
+      this.#drawn.set(id, parts);
+      this.element.append(group);
+    }
+    return parts;
+  }
+
+  /** @param {Shape} shape @param {View} view @param {boolean} hot */
+  #place(shape, view, hot) {
+    const { group, halo, ink, text } = this.#parts(shape.id);
+    const isPoint = shape.kind === "mark" || shape.kind === "handle";
+    const family = isPoint || shape.kind === "arrow" ? "" : "line";
+    group.setAttribute("class", `${shape.kind} ${family} ${shape.class ?? ""} ${hot ? "hot" : ""}`);
+    const canvas = shape.points.map((point) => view.toCanvas(point));
+    if (isPoint) {
+      group.setAttribute("transform", `translate(${canvas[0][0]} ${canvas[0][1]})`);
+      halo.setAttribute("d", shape.kind === "mark" ? MARK : HANDLE);
+      ink.setAttribute("d", shape.kind === "mark" ? MARK : HANDLE_CORE);
+    } else {
+      const path = shape.kind === "arrow" ? arrowPath(canvas[0], canvas[1]) : linePath(canvas, shape.kind === "polygon");
+      halo.setAttribute("d", path);
+      ink.setAttribute("d", path);
+    }
+    if (text.textContent !== (shape.label ?? "")) text.textContent = shape.label ?? "";
+    decorate(text, isPoint ? { x: 10, y: -9 } : { x: (canvas[0]?.[0] ?? 0) + 8, y: (canvas[0]?.[1] ?? 0) - 8 });
+  }
+}
+
+/** The shape a pointer would grab: points before lines before insides, nearest first. @param {Shape[]} shapes @param {View} view @param {Point} canvas */
+export function shapeAt(shapes, view, canvas) {
+  /** @type {{shape: Shape, rank: number, distance: number} | null} */
+  let best = null;
+  for (const shape of shapes) {
+    if (!shape.grab) continue;
+    const found = reach(shape, view, canvas);
+    if (found !== null && (best === null || found.rank < best.rank || (found.rank === best.rank && found.distance <= best.distance))) best = { shape, ...found };
+  }
+  return best?.shape ?? null;
+}
+
+/** @param {Shape} shape @param {View} view @param {Point} pointer @returns {{rank: number, distance: number} | null} */
+function reach(shape, view, pointer) {
+  const canvas = shape.points.map((point) => view.toCanvas(point));
+  const radius = GRAB_RADIUS[shape.kind];
+  if (shape.kind === "mark" || shape.kind === "handle") {
+    const d = distance(canvas[0], pointer);
+    return d <= radius ? { rank: 0, distance: d } : null;
+  }
+  const ends = shape.kind === "polygon" ? [...canvas.slice(1), canvas[0]] : canvas.slice(1);
+  const d = Math.min(...ends.map((end, i) => distanceToSegment(pointer, canvas[i], end)));
+  if (d <= radius) return { rank: 1, distance: d };
+  return shape.kind === "polygon" && isInside(pointer, canvas) ? { rank: 2, distance: 0 } : null;
+}
+
+/** @param {Point[]} points @param {boolean} closed */
+const linePath = (points, closed) => (points.length === 0 ? "" : `M${points.map((point) => point.join(" ")).join("L")}${closed ? "Z" : ""}`);
+
+/** @param {Point} tail @param {Point} head */
+function arrowPath(tail, head) {
+  const along = Math.atan2(head[1] - tail[1], head[0] - tail[0]);
+  const barb = (/** @type {number} */ turn) => [head[0] - 7 * Math.cos(along + turn), head[1] - 7 * Math.sin(along + turn)].join(" ");
+  const barbs = distance(tail, head) > 9 ? `M${barb(0.5)}L${head.join(" ")}L${barb(-0.5)}` : "";
+  return `M${tail.join(" ")}L${head.join(" ")}${barbs}`;
+}

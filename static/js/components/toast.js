@@ -1,0 +1,52 @@
+// Short messages at the bottom, and a voice for screen readers.
+
+import { h } from "../lib/dom.js";
+import { icon } from "../lib/icons.js";
+import { isAbort, sentence } from "../lib/api.js";
+
+/**
+ * @typedef {object} ToastOptions
+ * @property {"info" | "good" | "warn" | "bad"} [tone]
+ * @property {{label: string, run: () => void}} [action]  one thing to do about it, such as Undo
+ * @property {number} [seconds]  how long; 0 until dismissed
+ */
+
+const tray = h("div", { class: "toasts", role: "region", "aria-label": "Messages" });
+const voice = h("div", { class: "visually-hidden", role: "status", "aria-live": "polite" });
+const ICONS = /** @type {const} */ ({ info: "info", good: "check", warn: "warn", bad: "warn" });
+
+/** @param {string} message @param {ToastOptions} [options] @returns {() => void} takes it away */
+export function toast(message, { tone = "info", action, seconds = tone === "bad" ? 12 : 6 } = {}) {
+  if (!tray.isConnected) document.body.append(tray, voice);
+  const close = () => element.remove();
+  const element = h(
+    "div",
+    { class: `toast ${tone}`, role: tone === "bad" || tone === "warn" ? "alert" : "status" },
+    icon(ICONS[tone]),
+    h("p", {}, message),
+    action && h("button", { class: "button small", type: "button", onclick: () => (close(), action.run()) }, action.label),
+    h("button", { class: "button quiet small icon-only", type: "button", "aria-label": "Dismiss", onclick: close }, icon("close", "small")),
+  );
+  tray.append(element);
+  while (tray.children.length > 4) tray.firstElementChild?.remove();
+  if (seconds > 0) hideAfter(element, seconds);
+  return close;
+}
+
+/** Tell what went wrong in the engine's sentence; our own cancelling is no news. @param {unknown} error */
+export function toastError(error) {
+  if (!isAbort(error)) toast(sentence(error), { tone: "bad" });
+}
+
+/** Say to assistive technology only. @param {string} message */
+export function announce(message) {
+  if (!voice.isConnected) document.body.append(tray, voice);
+  voice.textContent = message;
+}
+
+/** Wait while the pointer rests on it. @param {HTMLElement} element @param {number} seconds */
+function hideAfter(element, seconds) {
+  let timer = window.setTimeout(() => element.remove(), seconds * 1000);
+  element.addEventListener("pointerenter", () => window.clearTimeout(timer));
+  element.addEventListener("pointerleave", () => (timer = window.setTimeout(() => element.remove(), 3000)));
+}

@@ -1,0 +1,171 @@
+// The project as this tab knows it. An edit shows at once, is saved at once, and is one step of the server's history.
+// Edits wait for each other, so the revision is always the one the server gave last; an edit on top of somebody
+// else's newer state is refused by the server (409), and told, not obeyed.
+
+import { Emitter } from "./emitter.js";
+import { ApiError, get, post, projectPath, put } from "./api.js";
+
+/** @typedef {import("./types.js").Project} Project */
+/** @typedef {import("./types.js").ProjectState} ProjectState */
+/** @typedef {(draft: Project) => void} Change */
+/** @typedef {{label: string, change: Change, merge: boolean}} Edit */
+
+/**
+ * @typedef {object} StoreEvents
+ * @property {{project: Project, previous: Project, origin: "edit" | "saved" | "server" | "undo"}} change
+ * @property {"saved" | "saving" | "failed"} saving
+ * @property {{label: string, again: () => void}} conflict  another tab was faster; `again` repeats the edit on the newer state
+ * @property {{label: string, error: unknown}} refused  the server found the edit wrong; it was taken back
+ */
+
+/** @extends {Emitter<StoreEvents>} */
+export class ProjectStore extends Emitter {
+  /** @type {Edit[]} */
+  #waiting = [];
+  /** @type {Promise<void>} */
+  #work = Promise.resolve();
+  #busy = false;
+
+  /** @param {ProjectState} state */
+  constructor(state) {
+    super();
+    this.state = state;
+    this.project = state.project;
+  }
+
+  /** @param {string} id */
+  static async open(id) {
+    return new ProjectStore(await get(projectPath(id)));
+  }
+
+  get id() {
+    return this.state.id;
+  }
+
+  get revision() {
+    return this.state.revision;
+  }
+
+  /**
+   * Change the project. `change` mutates a draft; it may run again on a newer state.
+   * @param {string} label what undo will be called: "Move pair 3"
+   * @param {Change} change
+   * @param {{merge?: boolean}} [options] merge: one undo step with the edit before, when that has the same label (nudges, sliders)
+   * @returns {Promise<void>} when saved or refused
+   */
+  edit(label, change, { merge = false } = {}) {
+    const previous = this.project;
+    this.project = changed(previous, change);
+    const last = this.#waiting.at(-1);
+    if (merge && last?.merge && last.label === label) last.change = inOrder(last.change, change);
+    else this.#waiting.push({ label, change, merge });
+    this.emit("change", { project: this.project, previous, origin: "edit" });
+    return this.#saveAll();
+  }
+
+  /** @returns {Promise<void>} */
+  undo() {
+    return this.#step("undo");
+  }
+
+  /** @returns {Promise<void>} */
+  redo() {
+    return this.#step("redo");
+  }
+
+  /** Take what the server has now. @returns {Promise<void>} */
+  refresh() {
+    return this.#then(async () => this.#adopt(await get(projectPath(this.id)), "server"));
+  }
+
+  /** Told by the event stream that a revision exists. @param {number} revision */
+  heardOf(revision) {
+    if (!this.#busy && revision !== this.revision) void this.refresh();
+  }
+
+  /** Resolves when nothing waits to be saved. @returns {Promise<void>} */
+  settled() {
+    return this.#work;
+  }
+
+  /** @param {"undo" | "redo"} which */
+  #step(which) {
+    return this.#then(async () => {
+      try {
+        this.#adopt(await post(projectPath(this.id, which), { revision: this.revision }), "undo");
+      } catch (error) {
+        if (!(error instanceof ApiError && error.status === 409)) throw error;
+        await this.#reload();
+        this.emit("conflict", { label: which, again: () => void this.#step(which) });
+      }
+    });
+  }
+
+  #saveAll() {
+    return this.#then(async () => {
+      while (this.#waiting.length > 0) await this.#save(/** @type {Edit} */ (this.#waiting.shift()));
+    });
+  }
+
+  /** @param {Edit} edit */
+  async #save({ label, change, merge }) {
+    this.emit("saving", "saving");
+    const project = changed(this.state.project, change);
+    try {
+      const state = await put(projectPath(this.id), { project, revision: this.revision, label, merge });
+      this.#adopt({ ...this.state, ...state }, "saved");
+      this.emit("saving", "saved");
+    } catch (error) {
+      this.#waiting = [];
+      await this.#reload();
+      if (error instanceof ApiError && error.status === 409) this.emit("conflict", { label, again: () => void this.edit(label, change) });
+      else this.emit("refused", { label, error });
+    }
+  }
+
+  async #reload() {
+    try {
+      this.#adopt(await get(projectPath(this.id)), "server");
+      this.emit("saving", "saved");
+    } catch {
+      this.project = this.state.project;
+      this.emit("change", { project: this.project, previous: this.project, origin: "server" });
+      this.emit("saving", "failed");
+    }
+  }
+
+  /** @param {ProjectState} state @param {"saved" | "server" | "undo"} origin */
+  #adopt(state, origin) {
+    const previous = this.project;
+    this.state = state;
+    this.project = this.#waiting.reduce((project, edit) => changed(project, edit.change), state.project);
+    this.emit("change", { project: this.project, previous, origin });
+  }
+
+  /** Queue work behind all earlier work. @param {() => Promise<void>} task @returns {Promise<void>} */
+  #then(task) {
+    const result = this.#work.then(async () => {
+      this.#busy = true;
+      try {
+        await task();
+      } finally {
+        this.#busy = false;
+      }
+    });
+    this.#work = result.catch(() => undefined);
+    return result;
+  }
+}
+
+/** @param {Project} project @param {Change} change @returns {Project} */
+function changed(project, change) {
+  const draft = structuredClone(project);
+  change(draft);
+  return draft;
+}
+
+/** @param {Change} first @param {Change} second @returns {Change} */
+const inOrder = (first, second) => (draft) => {
+  first(draft);
+  second(draft);
+};
