@@ -1,0 +1,264 @@
+"""The named scenes, each a few words about what is different from the ordinary one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sample_data import painting
+from sample_data.flight import Flight, Gust, Wandering
+from sample_data.optics import TrueLens
+from sample_data.scene import Body, Light, Measured, Plate, Recording, Relief, RoofLines, Scene, Sensor, Survey
+from sample_data.shaking import Earthquake, Shaking, at_rest
+from sample_data.textures import Texture
+
+Floats = NDArray[np.float64]
+Rng = np.random.Generator
+
+PIXEL_BLUR_PX = 0.55
+"""What lens and pixel together smear a point to: one standard deviation, pixels."""
+
+
+@dataclass(frozen=True)
+class Brief:
+    """A scene in an engineer's words; the ordinary one, EQ7-like, is all defaults.
+
+    Attributes:
+        size_px: width and height of the upright video.
+        focal_share: focal length as a part of the longer side of the image.
+        altitude_m, roof_m: heights of camera and roof above the ground.
+        off_nadir_deg: how far the camera looks away from straight down.
+        pre_event_s, event_s, post_event_s: lengths of the clip's parts.
+        starts_s: how far into the motion the clip starts: everything before is cut off.
+        peak_m, residual_m, natural_hz, damping, rotation_rad: of the roof.
+        drift_m, drift_band_hz: of the hovering camera.
+        turn_deg: slow turning of the camera, and its gimbal's quick wobble.
+        texture: contrast of the ground, 1 for ordinary ground.
+        noise: read noise (grey levels) and shot noise (variance per grey level).
+        extras: what else stands, passes or changes.
+    """
+
+    size_px: tuple[int, int] = (3840, 2160)
+    focal_share: float = 0.56
+    altitude_m: float = 42.0
+    roof_m: float = 18.3
+    off_nadir_deg: float = 1.2
+    pre_event_s: float = 9.0
+    event_s: float = 8.0
+    post_event_s: float = 5.0
+    starts_s: float = 0.0
+    peak_m: float = 0.42
+    residual_m: tuple[float, float] = (0.0, 0.0)
+    natural_hz: float = 1.1
+    damping: float = 0.06
+    rotation_rad: float = 2e-3
+    drift_m: float = 0.2
+    drift_band_hz: tuple[float, float] = (0.03, 0.45)
+    turn_deg: tuple[float, float] = (0.35, 0.02)
+    texture: float = 1.0
+    noise: tuple[float, float] = (1.2, 0.022)
+    roof_size_m: tuple[float, float] = (10.6, 7.4)
+    sensor: Sensor = field(default_factory=Sensor)
+    recording: Recording = field(default_factory=Recording)
+    survey: Survey = field(default_factory=Survey)
+    extras: tuple[Callable[[Scene, Brief, Rng], Scene], ...] = ()
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the clip."""
+        return self.pre_event_s + self.event_s + self.post_event_s - self.starts_s
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length, pixels."""
+        return self.focal_share * max(self.size_px)
+
+
+def build(
+    name: str, *, seed: int = 1, size_px: tuple[int, ...] | None = None, duration_s: float | None = None
+) -> Scene:
+    """Return a scene of the catalogue, perhaps in another size or length.
+
+    Raises:
+        KeyError: no scene has this name.
+    """
+    brief = SCENES[name]
+    if size_px is not None:
+        brief = replace(brief, size_px=(size_px[0], size_px[1]))
+    if duration_s is not None:
+        share = duration_s / brief.duration_s
+        brief = replace(
+            brief,
+            pre_event_s=brief.pre_event_s * share,
+            event_s=brief.event_s * share,
+            post_event_s=brief.post_event_s * share,
+            starts_s=brief.starts_s * share,
+        )
+    return compose(name, brief, seed)
+
+
+def compose(name: str, brief: Brief, seed: int) -> Scene:
+    """Return the scene a brief describes; everything random follows from the seed."""
+    rng = np.random.default_rng([seed, 1])
+    ground_pixel = brief.altitude_m / brief.focal_px
+    shaking = _shaking(brief, rng)
+    flight = _flight(brief, rng)
+    roof, lines = _roof(brief, rng, shaking)
+    scene = Scene(
+        name=name,
+        seed=seed,
+        duration_s=brief.duration_s,
+        lens=_lens(brief, rng),
+        flight=flight,
+        ground=painting.paint_ground(
+            rng, _ground_extent(brief, flight), texel_m=ground_pixel / 3, blur_m=PIXEL_BLUR_PX * ground_pixel, contrast=brief.texture
+        ),
+        relief=Relief.random(rng, 0.04, 1.1 * brief.altitude_m),
+        plates=(roof, *_standing_objects(brief, rng)),
+        body=_body(brief, rng, roof, shaking),
+        measured=(Measured(roof, lines),),
+        light=_light(brief, rng),
+        sensor=replace(brief.sensor, read_noise=brief.noise[0], shot_noise=brief.noise[1]),
+        recording=brief.recording,
+        survey=replace(brief.survey, intervals_s=_intervals(brief)),
+    )
+    for extra in brief.extras:
+        scene = extra(scene, brief, rng)
+    return scene
+
+
+def _shaking(brief: Brief, rng: Rng) -> Shaking:
+    quake = Earthquake(
+        start_s=brief.pre_event_s,
+        duration_s=brief.event_s,
+        peak_m=brief.peak_m,
+        residual_m=brief.residual_m,
+        rotation_rad=brief.rotation_rad,
+        table_peak_m=0.3 * brief.peak_m,
+        natural_hz=brief.natural_hz,
+        damping=brief.damping,
+    )
+    whole = Shaking.of(quake, brief.duration_s + brief.starts_s, rng)
+    cut = brief.starts_s
+    return Shaking(lambda t: whole.table(np.asarray(t) + cut), lambda t: whole.roof(np.asarray(t) + cut)) if cut else whole
+
+
+def _flight(brief: Brief, rng: Rng) -> Flight:
+    way, away = rng.uniform(0, 2 * np.pi), rng.uniform(0.03, 0.055) * brief.altitude_m / brief.focal_share
+    lean = brief.altitude_m * np.tan(np.radians(brief.off_nadir_deg if brief.off_nadir_deg > 5 else 0.0))
+    heading = rng.uniform(-0.12, 0.12)
+    # An oblique camera stands back, so that the building stays in view.
+    back = 0.75 * lean * np.array([np.sin(heading), np.cos(heading)])
+    centre = np.array([away * np.cos(way) - back[0], away * np.sin(way) - back[1], brief.altitude_m])
+    slow, quick = np.radians(brief.turn_deg)
+    length = brief.duration_s
+    return Flight(
+        centre_m=centre,
+        off_nadir_rad=float(np.radians(brief.off_nadir_deg)),
+        heading_rad=heading,
+        drift=Wandering.random(
+            rng, reach=brief.drift_m * np.array([1.0, 0.85, 0.5]), band_hz=brief.drift_band_hz, duration_s=length
+        ),
+        turning=(
+            Wandering.random(rng, reach=slow * np.array([1.0, 0.9, 0.8]), band_hz=(0.04, 0.5), duration_s=length),
+            Wandering.random(rng, reach=quick * np.array([1.0, 1.0, 0.4]), band_hz=(0.7, 4.0), duration_s=length),
+        ),
+    )
+
+
+def _lens(brief: Brief, rng: Rng) -> TrueLens:
+    width, height = brief.size_px
+    focal = brief.focal_px * (1 + rng.normal(0, 0.004)) * np.array([1.0, 1 + rng.normal(0, 3e-4)])
+    centre = np.array([(width - 1) / 2, (height - 1) / 2]) + rng.normal(0, 0.004 * width, 2)
+    distortion = np.array([-0.125, 0.105, 4e-4, -3e-4, -0.018]) * rng.uniform(0.85, 1.15, 5)
+    return TrueLens((width, height), focal, centre, distortion)
+
+
+def _ground_extent(brief: Brief, flight: Flight) -> tuple[float, float, float, float]:
+    """Return west, south, east, north of what any frame may see, roughly; beyond, the ground repeats mirrored."""
+    half = 0.5 * np.array(brief.size_px) / brief.focal_px * 1.1
+    tilt = flight.off_nadir_rad if brief.off_nadir_deg > 5 else 0.0
+    x, y = flight.centre_m[:2]
+    near, far = np.tan(tilt - np.arctan(half[1])), np.tan(tilt + np.arctan(half[1]))
+    wide = half[0] / np.cos(tilt) / (1 - np.tan(tilt) * half[1])
+    margin = 2.0 + 0.12 * brief.altitude_m * half[0]
+    east = brief.altitude_m * wide + margin
+    return float(x - east), float(y + brief.altitude_m * near - margin), float(x + east), float(y + brief.altitude_m * far + margin)
+
+
+def _roof(brief: Brief, rng: Rng, shaking: Shaking) -> tuple[Plate, RoofLines]:
+    pixel = (brief.altitude_m - brief.roof_m) / brief.focal_px
+    wide, deep = brief.roof_size_m
+    x, y = rng.uniform(-0.5, 0.5), rng.uniform(-0.25, 0.25)
+    lines = RoofLines(y + 0.61, y - 0.61, x, (-0.36 * wide, 0.36 * wide), (-0.4 * deep, 0.4 * deep))
+    texture = painting.paint_roof(rng, brief.roof_size_m, lines, texel_m=pixel / 4, blur_m=PIXEL_BLUR_PX * pixel)
+    centre = tuple(rng.uniform(-0.6, 0.6, 2))
+    return Plate("roof", brief.roof_m, texture, centre, rng.uniform(-0.02, 0.02), shaking.roof), lines
+
+
+def _body(brief: Brief, rng: Rng, roof: Plate, shaking: Shaking) -> Body:
+    wide, deep = brief.roof_size_m
+    size = (wide - 0.1, deep - 0.1)
+    walls = tuple(painting.paint_wall(rng, size[side % 2], brief.roof_m) for side in range(4))
+    return Body(size, 0.0, brief.roof_m - 0.02, roof.centre_m, roof.heading_rad, shaking.table, shaking.roof, walls)
+
+
+def _standing_objects(brief: Brief, rng: Rng) -> list[Plate]:
+    """Return parked cars, containers and crates around the building: they stand still but are no flat ground."""
+    pixel = brief.altitude_m / brief.focal_px
+    fine = {"texel_m": pixel / 3, "blur_m": PIXEL_BLUR_PX * pixel}
+    reach = 0.42 * np.array(brief.size_px) * pixel
+    plates = []
+    for number in range(9):
+        while True:
+            at = rng.uniform(-reach, reach)
+            if np.abs(at / [13.0, 11.0]).max() > 1:
+                break
+        kind = number % 3
+        if kind == 0:
+            texture, height = painting.paint_car(rng, **fine), 1.45
+        elif kind == 1:
+            texture = painting.paint_box(rng, (6.06, 2.44), rng.uniform(60, 180), painting.BLUE, **fine)
+            height = 2.6
+        else:
+            texture = painting.paint_box(rng, (1.2, 1.0), rng.uniform(60, 220), painting.SOIL, **fine)
+            height = 0.8
+        plates.append(Plate(f"parked {number}", height, texture, (at[0], at[1]), rng.uniform(0, np.pi)))
+    return plates
+
+
+def _light(brief: Brief, rng: Rng) -> Light:
+    phase = rng.uniform(0, 2 * np.pi)
+    way = rng.uniform(0, 2 * np.pi)
+    return Light(
+        shadow_m_per_m=(0.55 * np.cos(way), 0.55 * np.sin(way)),
+        exposure=lambda t: 1 + 0.04 * np.sin(2 * np.pi * 0.04 * np.asarray(t) + phase),
+    )
+
+
+def _intervals(brief: Brief) -> dict[str, tuple[float, float] | None]:
+    start, end = brief.pre_event_s - brief.starts_s, brief.duration_s
+    settle = min(1.6, 0.35 * brief.post_event_s)
+    tail = (round(end - brief.post_event_s + settle, 2), round(end - 0.1, 2))
+    if start <= 0.5:
+        return {"pre_event": tail, "event": (0.0, tail[0]), "residual": None}
+    return {"pre_event": (0.0, round(start - 0.1, 2)), "event": (round(start, 2), tail[0]), "residual": tail}
+
+
+SCENES: dict[str, Brief] = {
+    "eq5": Brief(peak_m=0.10, rotation_rad=8e-4),
+    "eq7": Brief(),
+    "eq9": Brief(altitude_m=62.0, peak_m=0.795, residual_m=(0.22, 0.015), natural_hz=0.8, rotation_rad=3e-3, post_event_s=6.0),
+    "small": Brief(
+        size_px=(960, 540),
+        focal_share=0.99,
+        pre_event_s=3.0,
+        event_s=3.0,
+        post_event_s=2.0,
+        recording=Recording(bit_rate=8_000_000),
+        survey=Survey(cloud_points=120_000, boards=0),
+    ),
+}
