@@ -16,14 +16,14 @@ import numpy as np
 from core.cloud import Cloud, fit_ground_plane, read_cloud
 from core.coordinates import Floats
 from core.errors import InputError
+from core.georeference import fit_reference
 from core.intervals import within
 from core.lens import Lens, read_lens, require_image_size
 from core.progress import Progress, silent
 from core.project import LINE_NAMES, PROJECT_FILE, Band, Lines, Project, Target, project_problems, read_project
+from core.validation import read_gps
 from core.video import FrameIndex, VideoInfo, frame_index, probe
 
-# Four pairs determine a homography; fewer leave it open.
-MIN_CORRESPONDENCES = 4
 # Lines that cross at a smaller angle have an intersection that runs along both with every small error.
 MIN_CROSSING_RAD = np.radians(20.0)
 # L1 and L2 closer than a strip is wide are one line clicked twice.
@@ -83,11 +83,21 @@ def _read_inputs(folder: Path, project: Project, problems: list[str], progress: 
     cloud = tried(read_cloud, folder / given.cloud, progress) if given.cloud else None
     if cloud:
         tried(fit_ground_plane, cloud, project.orthoimage.ground_z_m)
+    if given.gps:
+        tried(read_gps, folder / given.gps.file, given.gps)
+    if info and bool(lens) == bool(given.lens):
+        tried(_fit_reference, project, lens, info)
     return _Inputs(info=info, index=index, lens=lens, cloud=cloud)
 
 
 def _require_lens_of_video(lens: Lens, lens_file: Path, info: VideoInfo, video: Path) -> None:
     require_image_size(lens, width=info.width, height=info.height, lens_file=lens_file, video_file=video)
+
+
+def _fit_reference(project: Project, lens: Lens | None, info: VideoInfo) -> None:
+    size = (info.width, info.height)
+    if lens is None or lens.image_size_px == size:
+        fit_reference(project.correspondences, lens or Lens.ideal(size, max(size)), has_lens=lens is not None)
 
 
 def _video_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
@@ -102,15 +112,9 @@ def _video_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
 
 
 def _correspondence_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
-    enabled = [pair for pair in project.correspondences if pair.enabled]
-    if len(enabled) < MIN_CORRESPONDENCES:
-        yield (
-            f"correspondences: {len(enabled)} enabled, but the reference frame needs {MIN_CORRESPONDENCES} or more, "
-            "better 20; click more pairs"
-        )
     if project.method == "geometric" and project.inputs.lens is None:
         yield 'inputs.lens: missing, but method "geometric" needs it; calibrate with rooftrack lens, or choose "paper"'
-    for pair in enabled:
+    for pair in (pair for pair in project.correspondences if pair.enabled):
         if inputs.info and not _within_frame(pair.frame_px, inputs.info):
             u, v = pair.frame_px
             size = f"{inputs.info.width} x {inputs.info.height}"

@@ -32,9 +32,11 @@ ORDER = (
     "roof_lines",
     "roof_points",
     "motion",
+    "following",
     "drift",
     "validation",
     "results",
+    "measurements",
     "measure",
     "solve",
     "figures",
@@ -45,7 +47,7 @@ ORDER = (
 )
 # Steps of the measurement: others may know what they return, only conductors call them.
 STEPS = {"georeference", "ground", "roof_lines", "roof_points", "motion", "drift", "validation"}
-CONDUCTORS = {"measure", "solve", "figures", "report", "check", "run"}
+CONDUCTORS = {"following", "measure", "solve", "figures", "report", "check", "run"}
 
 # Libraries that enter the program through one door only; the sample is rendered outside of it.
 DOORS = {

@@ -12,6 +12,8 @@ from core.check import check_project
 from core.lens import Lens, write_lens
 from tests import small_project
 
+IN_A_LINE = [{"id": i, "ground_m": [i, 0], "frame_px": [i, i * i]} for i in range(5)]
+
 Change = Callable[[dict[str, Any]], object]
 
 
@@ -55,8 +57,13 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
         (put("gone.laz", "inputs", "cloud"), "gone.laz: not found"),
         (put(90, "reference_frame"), "reference_frame: is 90, but the video ends with frame 39"),
         (put([[30, 45]], "excluded_frames"), "excluded_frames[0]: [30, 45] ends after the last frame, 39"),
-        (put([], "correspondences"), "correspondences: 0 enabled"),
-        (put(False, "correspondences", 0, "enabled"), None),
+        (put([], "correspondences"), "no correspondence is enabled, at least four are needed"),
+        (
+            put([{"id": i, "ground_m": [i, 0], "frame_px": [i, i * i]} for i in range(5)], "correspondences"),
+            "collinear",
+        ),
+        (put("gone.csv", "inputs", "gps", "file"), "gone.csv"),
+        (put("up_m", "inputs", "gps", "x"), "up_m"),
         (put([200, 10], "correspondences", 0, "frame_px"), "id 1: frame_px [200, 10] is outside the 160 x 120 frame"),
         (put([50, 0], "correspondences", 4, "ground_m"), "id 5: ground_m [50, 0] lies outside the point cloud"),
         (put([], "moving_regions_px"), "moving_regions_px: none"),
