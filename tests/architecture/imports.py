@@ -25,6 +25,7 @@ ORDER = (
     "camera",
     "point_files",
     "cloud",
+    "relief",
     "orthoimage",
     "georeference",
     "patches",
@@ -32,11 +33,13 @@ ORDER = (
     "roof_lines",
     "roof_points",
     "motion",
+    "flight",
     "following",
     "drift",
     "validation",
     "results",
     "measurements",
+    "paper",
     "measure",
     "solve",
     "figures",
@@ -46,8 +49,8 @@ ORDER = (
     "run",
 )
 # Steps of the measurement: others may know what they return, only conductors call them.
-STEPS = {"georeference", "ground", "roof_lines", "roof_points", "motion", "drift", "validation"}
-CONDUCTORS = {"following", "measure", "solve", "figures", "report", "check", "run"}
+STEPS = {"georeference", "ground", "roof_lines", "roof_points", "motion", "flight", "drift", "validation"}
+CONDUCTORS = {"following", "paper", "measure", "solve", "figures", "report", "check", "run"}
 
 # Libraries that enter the program through one door only; the sample is rendered outside of it.
 DOORS = {
