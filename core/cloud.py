@@ -193,7 +193,7 @@ def _read_compressed_pcd(path: Path) -> PointTable:
     except (ImportError, OSError) as error:
         raise InputError(
             f"{path}: compressed PCD is read with open3d, which cannot be loaded ({error}); on Debian or Ubuntu run "
-            f"`apt-get install {OPEN3D_PACKAGES}` and `pip install rooftrack[open3d]`, or export LAS, PLY or plain PCD."
+            f"`apt-get install {OPEN3D_PACKAGES}`, or export the cloud as LAS, PLY or plain PCD."
         ) from None
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         read = open3d.io.read_point_cloud(path, remove_nan_points=True)

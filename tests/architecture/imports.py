@@ -34,6 +34,7 @@ ORDER = (
     "roof_points",
     "motion",
     "flight",
+    "self_calibration",
     "following",
     "drift",
     "validation",
