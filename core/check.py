@@ -16,7 +16,7 @@ import numpy as np
 from core.cloud import Cloud, fit_ground_plane, read_cloud
 from core.coordinates import Floats
 from core.errors import InputError
-from core.georeference import fit_reference
+from core.georeference import ReferenceFit, fit_reference
 from core.intervals import within
 from core.lens import Lens, read_lens, require_image_size
 from core.progress import Progress, silent
@@ -40,17 +40,22 @@ class _Inputs:
     index: FrameIndex | None
     lens: Lens | None
     cloud: Cloud | None
+    reference: ReferenceFit | None
 
 
-def check_project(folder: Path, progress: Progress = silent) -> list[str]:
-    """Return each problem of a project folder, one line each with its remedy; none means that it can be measured."""
+def check_project(folder: Path, progress: Progress = silent, *, with_cloud: bool = True) -> list[str]:
+    """Return each problem of a project folder, one line each with its remedy; none means that it can be measured.
+
+    Args:
+        with_cloud: whether to read the point cloud too, which takes a minute for a large one.
+    """
     file = folder / PROJECT_FILE
     try:
         project = read_project(folder)
     except InputError as error:
         return _problems_of_file(file) or [str(error)]
     problems: list[str] = []
-    inputs = _read_inputs(folder, project, problems, progress)
+    inputs = _read_inputs(folder, project, problems, progress, with_cloud=with_cloud)
     for check in (_video_problems, _correspondence_problems, _region_problems, _target_problems, _time_problems):
         problems += [f"{file}: {problem}." for problem in check(project, inputs)]
     return problems
@@ -65,7 +70,9 @@ def _problems_of_file(file: Path) -> list[str]:
     return [f"{file}: {problem}." for problem in project_problems(document)]
 
 
-def _read_inputs(folder: Path, project: Project, problems: list[str], progress: Progress) -> _Inputs:
+def _read_inputs(
+    folder: Path, project: Project, problems: list[str], progress: Progress, *, with_cloud: bool
+) -> _Inputs:
     def tried(read: Callable[..., Result], *arguments: object) -> Result | None:
         try:
             return read(*arguments)
@@ -80,24 +87,24 @@ def _read_inputs(folder: Path, project: Project, problems: list[str], progress: 
     lens = tried(read_lens, folder / given.lens) if given.lens else None
     if given.lens and lens and info:
         tried(_require_lens_of_video, lens, folder / given.lens, info, video)
-    cloud = tried(read_cloud, folder / given.cloud, progress) if given.cloud else None
+    cloud = tried(read_cloud, folder / given.cloud, progress) if given.cloud and with_cloud else None
     if cloud:
         tried(fit_ground_plane, cloud, project.orthoimage.ground_z_m)
     if given.gps:
         tried(read_gps, folder / given.gps.file, given.gps)
-    if info and bool(lens) == bool(given.lens):
-        tried(_fit_reference, project, lens, info)
-    return _Inputs(info=info, index=index, lens=lens, cloud=cloud)
+    reference = tried(_fit_reference, project, lens, info) if info and bool(lens) == bool(given.lens) else None
+    return _Inputs(info=info, index=index, lens=lens, cloud=cloud, reference=reference)
 
 
 def _require_lens_of_video(lens: Lens, lens_file: Path, info: VideoInfo, video: Path) -> None:
     require_image_size(lens, width=info.width, height=info.height, lens_file=lens_file, video_file=video)
 
 
-def _fit_reference(project: Project, lens: Lens | None, info: VideoInfo) -> None:
+def _fit_reference(project: Project, lens: Lens | None, info: VideoInfo) -> ReferenceFit | None:
     size = (info.width, info.height)
-    if lens is None or lens.image_size_px == size:
-        fit_reference(project.correspondences, lens or Lens.ideal(size, max(size)), has_lens=lens is not None)
+    if lens is not None and lens.image_size_px != size:
+        return None
+    return fit_reference(project.correspondences, lens or Lens.ideal(size, max(size)), has_lens=lens is not None)
 
 
 def _video_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
@@ -156,10 +163,14 @@ def _target_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
             yield f'{place}.height_m: missing, but method "geometric" needs the height of "{target.name}"; add it'
         if target.lines is not None and target.kind == "lines":
             yield from _line_problems(target.lines, place)
-        for name, point in _corners(target):
-            if project.orthoimage.extent_m and not _within_extent(point, project.orthoimage.extent_m):
-                x, y = point
+        for name, (x, y) in _corners(target):
+            extent = project.orthoimage.extent_m
+            if extent and not (extent[0] <= x <= extent[2] and extent[1] <= y <= extent[3]):
                 yield f"{place}.{name}: [{x:g}, {y:g}] lies outside orthoimage.extent_m; move it or enlarge the extent"
+            if inputs.reference and inputs.info:
+                u, v = inputs.reference.raw_from_plan(np.array([[x, y]]))[0]
+                if not _within_frame((float(u), float(v)), inputs.info):
+                    yield f"{place}.{name}: [{x:g}, {y:g}] appears outside the reference frame; move it"
 
 
 def _corners(target: Target) -> Iterator[tuple[str, tuple[float, float]]]:
@@ -171,11 +182,6 @@ def _corners(target: Target) -> Iterator[tuple[str, tuple[float, float]]]:
             band: Band = getattr(target.lines, name)
             yield f"lines.{name}.from_m", band.from_m
             yield f"lines.{name}.to_m", band.to_m
-
-
-def _within_extent(place_m: tuple[float, float], extent_m: tuple[float, float, float, float]) -> bool:
-    west, south, east, north = extent_m
-    return west <= place_m[0] <= east and south <= place_m[1] <= north
 
 
 def _line_problems(lines: Lines, place: str) -> Iterator[str]:

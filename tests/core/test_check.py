@@ -71,6 +71,7 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
         (put([], "targets"), "targets: none"),
         (put(None, "targets", 0, "height_m"), 'targets[0].height_m: missing, but method "geometric" needs'),
         (put([-8, -8, 8, 1], "orthoimage", "extent_m"), "targets[0].lines.T1.to_m: [0, 2] lies outside orthoimage"),
+        (put([0, 9.5], "targets", 0, "lines", "T1", "to_m"), "T1.to_m: [0, 9.5] appears outside the reference frame"),
         (put([2, -0.2], "targets", 0, "lines", "T1", "from_m"), None),
         (put([-2, 1.9], "targets", 0, "lines", "T1", "from_m"), "L1 and T1 run nearly the same way"),
         (put([1.0, 5.0], "intervals_s", "residual"), "intervals_s.residual: [1, 5] reaches outside the video"),
@@ -129,6 +130,13 @@ def test_a_file_that_is_no_project(tmp_path: Path, text: str, told: str) -> None
 def test_a_folder_without_project(tmp_path: Path) -> None:
     (line,) = check_project(tmp_path)
     assert "project.json: not found; make a project with `rooftrack new" in line
+
+
+def test_a_large_cloud_may_be_left_out(inputs: Path) -> None:
+    document = small_project.document()
+    document["inputs"]["cloud"] = "gone.laz"
+    small_project.write_document(inputs, document)
+    assert check_project(inputs, with_cloud=False) == []
 
 
 def test_nothing_is_written(inputs: Path) -> None:
