@@ -290,6 +290,40 @@ def write_geotiff(path: Path | str, ortho: Orthoimage) -> None:
     write_atomically(Path(path), content.getvalue())
 
 
+def read_geotiff(path: Path | str) -> tuple[OrthoGrid, Pixels]:
+    """Read an orthoimage that `write_geotiff` wrote: its raster, and (height, width, 4) red, green, blue, opacity.
+
+    Raises:
+        InputError: the file is missing, damaged, or none of ours.
+    """
+    grid = read_grid(path)
+    try:
+        rgba = np.asarray(tifffile.imread(path), dtype=np.uint8)
+    except (OSError, ValueError, tifffile.TiffFileError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); make the orthoimage again.") from None
+    if rgba.shape != (grid.height, grid.width, 4):
+        raise InputError(f"{path}: is no orthoimage of this program; make it again.")
+    return grid, rgba
+
+
+def read_grid(path: Path | str) -> OrthoGrid:
+    """Return the raster of an orthoimage that `write_geotiff` wrote, without reading its pixels.
+
+    Raises:
+        InputError: as `read_geotiff`.
+    """
+    try:
+        with tifffile.TiffFile(path) as file:
+            page = file.pages[0]
+            assert isinstance(page, tifffile.TiffPage)
+            scale, tie = page.tags[33550].value, page.tags[33922].value
+            return OrthoGrid(float(tie[3]), float(tie[4]), float(scale[0]), page.imagewidth, page.imagelength)
+    except FileNotFoundError:
+        raise InputError(f"{path}: not found; make the orthoimage first.") from None
+    except (OSError, ValueError, KeyError, IndexError, tifffile.TiffFileError) as error:
+        raise InputError(f"{path}: is no orthoimage of this program ({error}); make it again.") from None
+
+
 def rectify_frame(frame: Pixels, lens: Lens, H_plan_und: ArrayLike, grid: OrthoGrid) -> tuple[Pixels, Bools]:
     """Lay a raw frame on the raster of an orthoimage; for pictures, nothing is measured in it.
 

@@ -1,0 +1,129 @@
+"""The orthoimage of a project: whether it is there, whether it still fits the project, and its pictures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from app.frames import Fingerprint, Picture, fingerprint, png_of, scaled_to
+from app.sites import read_site
+from app.store import CACHE_FOLDER, ProjectFolder, read_json
+from core.coordinates import OrthoGrid
+from core.errors import InputError
+from core.measure import video_identity
+from core.orthoimage import make_orthoimage, read_geotiff, read_grid, write_geotiff
+from core.progress import CancelToken, Progress
+from core.project import Project, read_project, write_atomically
+
+ORTHOIMAGE_FILE = "orthoimage.tif"
+_NOTE = "orthoimage.json"
+
+
+@dataclass(frozen=True)
+class OrthoState:
+    """An orthoimage on the disk.
+
+    Attributes:
+        ready: whether there is one.
+        stale: whether cloud or settings have changed since.
+        note: what was said when it was made: shares of measured and filled pixels, sentences.
+    """
+
+    ready: bool
+    stale: bool
+    grid: OrthoGrid | None
+    note: dict[str, Any]
+
+
+def state_of(folder: ProjectFolder, project: Project) -> OrthoState:
+    """Return the state of a project's orthoimage, without reading its pixels."""
+    file = folder.results / ORTHOIMAGE_FILE
+    try:
+        grid = _grid(fingerprint(file))
+    except InputError:
+        return OrthoState(ready=False, stale=False, grid=None, note={})
+    note = read_json(folder.results / CACHE_FOLDER / _NOTE)
+    note = note if isinstance(note, dict) and note.get("made") == list(fingerprint(file)[1:]) else {}
+    return OrthoState(ready=True, stale=_is_stale(folder, project, grid, note), grid=grid, note=note)
+
+
+@lru_cache(maxsize=32)
+def _grid(key: Fingerprint) -> OrthoGrid:
+    return read_grid(key[0])
+
+
+def _is_stale(folder: ProjectFolder, project: Project, grid: OrthoGrid, note: dict[str, Any]) -> bool:
+    settings, extent = project.orthoimage, project.orthoimage.extent_m
+    if abs(settings.pixel_size_m - grid.pixel_size_m) > 1e-9:
+        return True
+    if extent is not None and max(abs(a - b) for a, b in zip(extent, grid.extent_m, strict=True)) > grid.pixel_size_m:
+        return True
+    if not note:  # made by the command line, which makes it anew whenever it runs
+        return False
+    cloud = folder.input_path("cloud", project)
+    same_cloud = cloud is not None and cloud.is_file() and note["cloud"] == _identity(fingerprint(cloud))
+    return not same_cloud or note["settings"] != settings.model_dump(mode="json")
+
+
+@lru_cache(maxsize=32)
+def _identity(key: Fingerprint) -> str:
+    return video_identity(Path(key[0]))
+
+
+@lru_cache(maxsize=2)
+def _pixels(key: Fingerprint) -> tuple[OrthoGrid, Picture]:
+    return read_geotiff(key[0])
+
+
+def pixels(folder: ProjectFolder) -> tuple[OrthoGrid, Picture]:
+    """Return the raster and the picture, (height, width, 4) red, green, blue, opacity.
+
+    Raises:
+        InputError: there is none yet.
+    """
+    return _pixels(fingerprint(folder.results / ORTHOIMAGE_FILE))
+
+
+def png(folder: ProjectFolder, width: int | None) -> bytes:
+    """Return the picture as PNG, transparent where the cloud is empty.
+
+    Raises:
+        InputError: there is none yet.
+    """
+    return _png(fingerprint(folder.results / ORTHOIMAGE_FILE), width)
+
+
+@lru_cache(maxsize=4)
+def _png(key: Fingerprint, width: int | None) -> bytes:
+    rgba = scaled_to(_pixels(key)[1], width)
+    return png_of(rgba[..., :3], rgba[..., 3])
+
+
+def build(folder: Path, order: dict[str, Any], progress: Progress, cancel: CancelToken) -> dict[str, Any]:
+    """Make the orthoimage (the job `orthoimage`).
+
+    Raises:
+        InputError: the cloud or the settings cannot be used.
+    """
+    project = read_project(folder)
+    site = read_site(folder, order, progress, cancel)
+    cancel.raise_if_cancelled()
+    ortho = make_orthoimage(site.cloud, site.plane, project.orthoimage, progress)
+    cancel.raise_if_cancelled()
+    file = folder / "results" / ORTHOIMAGE_FILE
+    write_geotiff(file, ortho)
+    note = {
+        "made": list(fingerprint(file)[1:]),
+        "cloud": video_identity(Path(order["cloud"])),
+        "settings": project.orthoimage.model_dump(mode="json"),
+        "measured_share": ortho.measured_share,
+        "filled_share": ortho.filled_share,
+        "spacing_m": ortho.spacing_m,
+        "fill_limit_m": ortho.fill_limit_m,
+        "notes": list(ortho.notes),
+    }
+    write_atomically(folder / "results" / CACHE_FOLDER / _NOTE, json.dumps(note).encode())
+    return {"grid": vars(ortho.grid)}

@@ -1,0 +1,170 @@
+"""Point clouds of the projects: read once in a process of their own, kept as plain arrays, and in memory while used."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from app.errors import NotYet
+from app.frames import fingerprint
+from app.jobs import Jobs
+from app.store import CACHE_FOLDER, ProjectFolder, read_json
+from core.cloud import Cloud, GroundPlane, fit_ground_plane, read_cloud
+from core.errors import InputError
+from core.progress import CancelToken, Progress
+from core.project import Project, write_atomically
+
+_FACTS = "cloud.json"
+_ARRAYS = ("points_m", "colour", "intensity")
+_KEPT = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """A cloud, its ground, and the key that changes with either."""
+
+    key: str
+    cloud: Cloud
+    plane: GroundPlane
+
+
+class Sites:
+    """The clouds of the projects a person is looking at."""
+
+    def __init__(self, jobs: Jobs) -> None:
+        self._jobs = jobs
+        self._sites: OrderedDict[str, Site] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def facts(self, folder: ProjectFolder, project: Project, path: Path) -> dict[str, Any] | None:
+        """Return what is known of a project's cloud; None while a job reads it, which this starts.
+
+        Raises:
+            InputError: the cloud was read and cannot be used.
+        """
+        key = site_key(path, project)
+        facts = read_json(folder.results / CACHE_FOLDER / _FACTS)
+        if isinstance(facts, dict) and facts.get("key") == key:
+            if "error" in facts:
+                raise InputError(facts["error"])
+            return {name: value for name, value in facts.items() if name not in ("key", "source", "plane")}
+        self._read(folder, project, path, key)
+        return None
+
+    def site(self, folder: ProjectFolder, project: Project) -> Site:
+        """Return the cloud and the ground of a project.
+
+        Raises:
+            NotYet: it is still being read, which this starts.
+            InputError: it cannot be used.
+        """
+        path = folder.require_input("cloud", project)
+        if self.facts(folder, project, path) is None:
+            raise NotYet("The cloud is being read; it takes a moment the first time.", path="inputs.cloud")
+        key = site_key(path, project)
+        with self._lock:
+            site = self._sites.pop(key, None) or _load(folder.results / CACHE_FOLDER, key)
+            self._sites[key] = site
+            while len(self._sites) > _KEPT:
+                self._sites.popitem(last=False)
+        return site
+
+    def site_if_read(self, folder: ProjectFolder, project: Project) -> Site | None:
+        """Return the cloud and the ground where they are there at once; None where there are none, or not yet."""
+        try:
+            return self.site(folder, project) if project.inputs.cloud else None
+        except Exception:  # whatever keeps the cloud away, what is asked for here can do without it
+            return None
+
+    def _read(self, folder: ProjectFolder, project: Project, path: Path, key: str) -> None:
+        if self._jobs.running(folder.id, "cloud") is None:
+            order = {"cloud": str(path), "key": key, "ground_z_m": project.orthoimage.ground_z_m}
+            self._jobs.start(folder, "cloud", order)
+
+
+def site_key(path: Path, project: Project) -> str:
+    """Return what changes whenever the cloud's file or the height of the ground does."""
+    return json.dumps([*fingerprint(path), project.orthoimage.ground_z_m])
+
+
+def read_site(folder: Path, order: dict[str, Any], progress: Progress, cancel: CancelToken) -> Site:
+    """Read a cloud and find its ground, keeping both as plain files that open in no time (the job `cloud`).
+
+    Raises:
+        InputError: the cloud cannot be used; that is kept too.
+    """
+    cache, path, key = folder / "results" / CACHE_FOLDER, Path(order["cloud"]), str(order["key"])
+    cache.mkdir(parents=True, exist_ok=True)
+    try:
+        cloud = _cached_cloud(cache, path, progress)
+        cancel.raise_if_cancelled()
+        plane = fit_ground_plane(cloud, order["ground_z_m"])
+    except InputError as error:
+        _write_facts(cache, {"key": key, "error": str(error)})
+        raise
+    _write_facts(cache, {"key": key, "source": list(fingerprint(path)), **_described(cloud, plane)})
+    return Site(key, cloud, plane)
+
+
+def _cached_cloud(cache: Path, path: Path, progress: Progress) -> Cloud:
+    facts = read_json(cache / _FACTS)
+    if isinstance(facts, dict) and facts.get("source") == list(fingerprint(path)):
+        return _arrays(cache, facts)
+    cloud = read_cloud(path, progress)
+    _write_facts(cache, {})
+    for name in _ARRAYS:
+        file = cache / f"cloud_{name}.npy"
+        file.unlink(missing_ok=True)
+        array = getattr(cloud, name)
+        if array is not None:
+            np.save(file, array)
+    return cloud
+
+
+def _load(cache: Path, key: str) -> Site:
+    facts = read_json(cache / _FACTS)
+    plane: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in facts["plane"].items()
+    }
+    return Site(key, _arrays(cache, facts), GroundPlane(**plane))
+
+
+def _arrays(cache: Path, facts: dict[str, Any]) -> Cloud:
+    found: dict[str, Any] = {}
+    for name in _ARRAYS:
+        file = cache / f"cloud_{name}.npy"
+        found[name] = np.load(file, mmap_mode="r") if file.is_file() else None
+    return Cloud(origin_m=np.array(facts["origin_m"]), notes=tuple(facts["notes"]), **found)
+
+
+def _described(cloud: Cloud, plane: GroundPlane) -> dict[str, Any]:
+    lowest, highest = cloud.extent_m
+    return {
+        "points": len(cloud),
+        "extent_m": [lowest.tolist(), highest.tolist()],
+        "origin_m": cloud.origin_m.tolist(),
+        "density_per_m2": plane.ground_points / plane.area_m2 if plane.area_m2 else None,
+        "has_color": cloud.colour is not None,
+        "has_intensity": cloud.intensity is not None,
+        "notes": list(cloud.notes),
+        "ground": {
+            "z_m": plane.at_m[2],
+            "spread_m": plane.elevation_std_m,
+            "p5_m": plane.elevation_p5_m,
+            "p95_m": plane.elevation_p95_m,
+            "tilt_deg": float(np.degrees(plane.tilt_rad)),
+            "points": plane.ground_points,
+            "area_m2": plane.area_m2,
+        },
+        "plane": vars(plane),
+    }
+
+
+def _write_facts(cache: Path, facts: dict[str, Any]) -> None:
+    write_atomically(cache / _FACTS, json.dumps(facts).encode())
