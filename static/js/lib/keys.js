@@ -13,7 +13,7 @@
 /** @type {KeyBinding[]} */
 const table = [];
 
-/** Add bindings. @param {KeyBinding[]} bindings */
+/** Add bindings; where two answer to a key, the later one wins. @param {KeyBinding[]} bindings */
 export function bindKeys(bindings) {
   table.push(...bindings);
 }
@@ -56,7 +56,7 @@ document.addEventListener("keydown", (event) => {
   const name = keyName(event);
   const typing = isTyping(event.target);
   if (isOwnKey(event.target, name)) return;
-  const binding = table.find(
+  const binding = table.findLast(
     (entry) => entry.run && entry.keys.split(" / ").includes(name) && (!typing || entry.inFields) && (entry.when?.() ?? true),
   );
   if (!binding?.run) return;

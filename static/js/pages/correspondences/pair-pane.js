@@ -1,0 +1,165 @@
+// One of the two panes: shows one side of every pair, takes clicks, drags and nudges, and draws ghosts and residuals.
+
+import { Pane } from "../../components/pane.js";
+import { Loupe } from "../../components/loupe.js";
+import { paneChrome } from "../../components/pane-chrome.js";
+import { add, subtract, times } from "../../lib/coordinates.js";
+import { Emitter } from "../../lib/emitter.js";
+import { otherSide } from "./slots.js";
+
+/** @typedef {import("../../lib/types.js").Point} Point */
+/** @typedef {import("./slots.js").Side} Side */
+/** @typedef {import("./slots.js").Slots} Slots */
+
+/**
+ * How what is stored (raw px, or metres on the ground) relates to px of the picture shown. Promises where the server
+ * must be asked (the undistorted picture).
+ * @typedef {object} Mapping
+ * @property {(stored: Point[]) => Point[] | Promise<Point[]>} shown
+ * @property {(shown: Point) => Point | Promise<Point>} stored
+ */
+
+/** @type {Mapping} */
+export const identity = { shown: (points) => points, stored: (point) => point };
+
+/** @extends {Emitter<{moving: {id: number, side: Side, point: Point}}>} */
+export class PairPane extends Emitter {
+  mapping = identity;
+  /** @type {Map<number, Point>} pair or half to px shown */
+  shown = new Map();
+  /** @type {Map<number, Point>} predicted places of counterparts, px shown */
+  ghosts = new Map();
+  /** @type {Map<number, Point>} from mark to where the fit wants it, px shown */
+  residuals = new Map();
+  arrowScale = 50;
+  #aims = false;
+  /** @type {Promise<void>} */
+  #nudges = Promise.resolve();
+  #asked = 0;
+
+  /**
+   * @param {HTMLElement} element
+   * @param {Slots} slots
+   * @param {{side: Side, label: string, title: string, readout: (point: Point) => (Node | string)[]}} options
+   */
+  constructor(element, slots, { side, label, title, readout }) {
+    super();
+    this.side = side;
+    this.slots = slots;
+    this.pane = new Pane(element, { label });
+    this.loupe = new Loupe(this.pane);
+    this.chrome = paneChrome(this.pane, { title, readout });
+    this.#listen();
+  }
+
+  /** The place of a pair in this pane, or of its ghost. @param {number} id */
+  placeOf(id) {
+    return this.shown.get(id) ?? this.ghosts.get(id) ?? null;
+  }
+
+  /** Recompute where everything is, after an edit or another mapping. */
+  refresh() {
+    const entries = [...this.slots.pairs, ...this.slots.halves].filter((entry) => entry[this.side] !== null);
+    const ids = entries.map((entry) => entry.id);
+    const ask = (this.#asked += 1);
+    const take = (/** @type {Point[]} */ points) => {
+      if (ask !== this.#asked || this.pane.isDragging) return;
+      this.shown = new Map(points.map((point, i) => [ids[i], point]));
+      this.draw();
+    };
+    const answer = this.mapping.shown(entries.map((entry) => /** @type {Point} */ (entry[this.side])));
+    if (answer instanceof Promise) answer.then(take, () => undefined);
+    else take(answer);
+  }
+
+  draw() {
+    const { pairs, halves, selected } = this.slots;
+    /** @type {import("../../components/shapes.js").Shape[]} */
+    const shapes = [];
+    const mark = (/** @type {number} */ id, /** @type {string} */ look) => {
+      const point = this.shown.get(id);
+      if (point === undefined) return;
+      const offset = this.residuals.get(id);
+      if (offset !== undefined && !look.includes("off")) shapes.push({ id: `residual-${id}`, kind: "arrow", class: "residual", points: [point, add(point, times(offset, this.arrowScale))] });
+      shapes.push({ id: `pair-${id}`, kind: "mark", class: `${look} ${id === selected ? "selected" : ""}`, label: String(id), points: [point], grab: true });
+    };
+    for (const pair of pairs) mark(pair.id, pair.enabled ? "" : "off");
+    for (const half of halves) {
+      const ghost = this.ghosts.get(half.id);
+      if (half[this.side] !== null) mark(half.id, "pending");
+      else if (ghost !== undefined) shapes.push({ id: `ghost-${half.id}`, kind: "mark", class: "ghost", label: `${half.id}?`, points: [ghost] });
+    }
+    if (this.#aims && this.pane.image !== null) shapes.push({ id: "aim", kind: "mark", class: "aim", points: [this.pane.centre] });
+    this.pane.setShapes(shapes);
+    const half = this.slots.waitingFor(this.side);
+    this.chrome.setHint(half === null ? "" : `Click completes pair ${half.id}`);
+  }
+
+  /** Zoom to a pair. @param {number} id @param {number} scale */
+  goTo(id, scale) {
+    const place = this.placeOf(id);
+    if (place !== null) this.pane.lookAt(place, Math.max(scale, this.pane.view.scale));
+  }
+
+  /** Move the selected mark a little. @param {Point} delta px shown */
+  nudge(delta) {
+    const id = this.slots.selected;
+    const from = id === null ? undefined : this.shown.get(id);
+    if (id === null || from === undefined) return;
+    const to = add(from, delta);
+    this.shown.set(id, to);
+    this.loupe.show(to);
+    this.#store(to, (stored) => this.slots.move(id, this.side, stored, true));
+  }
+
+  /** Place at the middle of the pane: the keyboard's click. */
+  placeAtAim() {
+    this.#place(this.pane.centre);
+  }
+
+  #listen() {
+    const { pane } = this;
+    const idOf = (/** @type {string} */ shapeId) => Number(shapeId.slice("pair-".length));
+    pane.on("click", ({ point }) => this.#place(point));
+    pane.on("select", ({ id }) => this.slots.select(idOf(id)));
+    pane.on("drag", ({ id, point }) => {
+      this.shown.set(idOf(id), point);
+      if (this.slots.selected !== idOf(id)) this.slots.select(idOf(id));
+      this.draw();
+      const stored = this.mapping.stored(point);
+      if (!(stored instanceof Promise)) this.emit("moving", { id: idOf(id), side: this.side, point: stored });
+    });
+    pane.on("drop", ({ id, point }) => this.#store(point, (stored) => this.slots.move(idOf(id), this.side, stored)));
+    pane.on("cancel", () => this.refresh());
+    pane.on("view", () => this.#aims && this.draw());
+    pane.element.addEventListener("keydown", () => this.#setAim(true));
+    pane.element.addEventListener("focus", () => this.#setAim(pane.element.matches(":focus-visible")));
+    pane.element.addEventListener("blur", () => this.#setAim(false));
+    pane.element.addEventListener("pointermove", () => this.#setAim(false));
+  }
+
+  /** @param {Point} point px shown */
+  #place(point) {
+    if (this.pane.image !== null) this.#store(point, (stored) => this.slots.place(this.side, stored));
+  }
+
+  /** In the order made, though the server may have to be asked. @param {Point} shown @param {(stored: Point) => void} use */
+  #store(shown, use) {
+    const stored = this.mapping.stored(shown);
+    if (stored instanceof Promise) this.#nudges = this.#nudges.then(async () => use(await stored)).catch(() => this.refresh());
+    else use(stored);
+  }
+
+  /** @param {boolean} aims */
+  #setAim(aims) {
+    if (aims === this.#aims) return;
+    this.#aims = aims;
+    this.draw();
+  }
+}
+
+/** Halves that need a ghost on a side: clicked on the other side only. @param {Slots} slots @param {Side} side */
+export const halvesWithout = (slots, side) => slots.halves.filter((half) => half[side] === null && half[otherSide(side)] !== null);
+
+/** Offset from a to b. @param {Point} a @param {Point} b */
+export const offset = (a, b) => subtract(b, a);
