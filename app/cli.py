@@ -308,7 +308,7 @@ def _add_serve(commands: argparse._SubParsersAction[_Parser]) -> None:
     )
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default 127.0.0.1)")
     parser.add_argument(
-        "--port", type=_port, default=8000, help="port to listen on, or the next free one (default 8000)"
+        "--port", type=_port, metavar="N", help="port to listen on (default 8000, or the next free one)"
     )
     parser.set_defaults(command=_serve)
 
