@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import wraps
 from pathlib import Path
 from typing import Any, ParamSpec
@@ -21,9 +21,10 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from core.coordinates import Floats
-from core.drift import AXIS_NAMES, CornerSweep, Spectrum
+from core.drift import AXIS_NAMES, CornerSweep, Spectrum, amplitude_spectrum, corner_sweep, high_pass
+from core.errors import InputError
 from core.intervals import within
-from core.project import Intervals, write_atomically
+from core.project import Drift, Intervals, write_atomically
 from core.results import TargetHistory
 from core.validation import GpsComparison
 
@@ -107,6 +108,48 @@ def encoded(figure: Figure, file_format: str = "png", *, dpi: int = 150) -> byte
     with _style():
         figure.savefig(stream, format=file_format, dpi=dpi, metadata=metadata)
     return stream.getvalue()
+
+
+def target_figures(
+    history: TargetHistory,
+    intervals: Intervals,
+    drift: Drift,
+    *,
+    comparison: GpsComparison | None = None,
+    antenna_m: ArrayLike | None = None,
+) -> dict[str, Figure]:
+    """Return every figure one target can have, by the name of its file; what the project cannot tell is left out.
+
+    The figures of drift show the unfiltered displacement, as the paper's do.
+
+    Args:
+        history: of the target.
+        intervals: of the project.
+        drift: of the project; its corner is marked, and drawn between the paper's 0.1 and 0.5 Hz.
+        comparison: with GPS.
+        antenna_m: (F, 2) the displacement that was compared with GPS; that of P1 where not given.
+    """
+    raw_m = history.p1_raw_m
+    drawn = {
+        "displacement": history_figure(history, intervals, {"unfiltered, at the paper's scale": raw_m}),
+        "orbit": orbit_figure(history),
+    }
+    resting = within(history.time_s, intervals.pre_event)
+    if intervals.pre_event is not None and np.isfinite(raw_m[resting]).all(axis=1).sum() >= 4:
+        spectrum = amplitude_spectrum(raw_m, history.time_s, intervals.pre_event)
+        drawn["pre_event"] = pre_event_figure(history.time_s[resting], raw_m[resting], spectrum)
+        # A clip too short for any corner of the sweep has no such figure.
+        with suppress(InputError):
+            sweep = corner_sweep(raw_m, history.time_s, intervals.pre_event, order=drift.order)
+            drawn["corner_sweep"] = corner_sweep_figure(sweep, drift.corner_hz)
+        with suppress(InputError):
+            corners = sorted({0.1, drift.corner_hz, 0.5})
+            filtered = {hz: high_pass(raw_m[:, 0], history.time_s, hz, drift.order) for hz in corners}
+            drawn["corner_effect"] = corner_effect_figure(history.time_s, raw_m[:, 0], filtered, intervals, comparison)
+    if comparison is not None:
+        moved = history.p1_m if antenna_m is None else antenna_m
+        drawn["gps"] = gps_figure(history.time_s, moved, comparison, intervals)
+    return drawn
 
 
 @styled
@@ -339,7 +382,7 @@ def camera_figure(time_s: ArrayLike, centre_m: ArrayLike, roll_pitch_yaw_rad: Ar
     for axis, (name, colour) in enumerate(zip(("x (east)", "y (north)", "height"), (BLUE, RED, GREEN), strict=True)):
         history.plot(times, drift_m[:, axis], color=colour, label=name)
     history.set_ylabel("drift, m")
-    history.set_title("Camera drift")
+    history.set_title("Camera")
     _legend(history)
     last = history
     if turns is not None:

@@ -223,15 +223,17 @@ def _gps_table(gps: GpsComparison) -> str:
     rms_x, rms_y = gps.rms_m
     text = (
         f"RMS difference {1000 * rms_x:.2f} mm in x and {1000 * rms_y:.2f} mm in y over {len(gps.time_s)} samples; "
-        f"GPS clock + {lag} = video clock. {gps.message}"
+        f"GPS time {lag} is video time. {gps.message}"
     )
     header = ["", "video, cm", "GPS, cm", "error, cm", "error, %"]
     return f"<h4>Comparison with GPS</h4><p>{escape(text.strip())}</p>{_table(header, rows)}"
 
 
 def _inputs(content: ReportContent) -> str:
-    rows = [[file.part, file.path, file.understood, file.sha256] for file in content.inputs]
-    return _table(["", "file", "understood as", "SHA-256"], rows, words=4)
+    return _facts(
+        Fact(file.part, ". ".join(filter(None, (file.path, file.understood, f"SHA-256 {file.sha256}"))))
+        for file in content.inputs
+    )
 
 
 def _method(project: Project) -> str:
@@ -369,14 +371,12 @@ def _facts(facts: Iterable[Fact]) -> str:
     return "<dl>" + "".join(f"<dt>{escape(fact.name)}</dt><dd>{escape(fact.value)}</dd>" for fact in facts) + "</dl>"
 
 
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]], *, words: int = 1) -> str:
-    """Return a table whose first `words` columns are text and whose others are numbers."""
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table whose first column names the row and whose others hold numbers."""
 
     def cells(tag: str, texts: Sequence[str]) -> str:
-        return "".join(
-            f"<{tag}>{escape(text)}</{tag}>" if place < words else f'<{tag} class="number">{escape(text)}</{tag}>'
-            for place, text in enumerate(texts)
-        )
+        name, *numbers = (escape(text) for text in texts)
+        return f"<{tag}>{name}</{tag}>" + "".join(f'<{tag} class="number">{number}</{tag}>' for number in numbers)
 
     body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
     return f"<table><thead><tr>{cells('th', header)}</tr></thead><tbody>{body}</tbody></table>"

@@ -14,7 +14,7 @@ from core import figures
 from core.coordinates import Floats
 from core.drift import amplitude_spectrum, corner_sweep, high_pass
 from core.intervals import within
-from core.project import Intervals
+from core.project import Drift, Intervals
 from core.results import TargetHistory
 from core.validation import GpsComparison, GpsRecord, compare_with_gps
 
@@ -93,11 +93,23 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_every_figure_is_the_same_picture_twice(name: str) -> None:
-    first, second = (figures.encoded(FIGURES[name](), dpi=50) for _ in range(2))
+def test_every_figure_draws(name: str) -> None:
+    picture = figures.encoded(FIGURES[name](), dpi=40)
+    assert picture.startswith(b"\x89PNG")
+    assert b"Software" not in picture
+
+
+@pytest.mark.parametrize("name", ["sweep", "frame"])
+def test_the_same_data_give_the_same_picture(name: str) -> None:
+    first, second = (figures.encoded(FIGURES[name](), dpi=40) for _ in range(2))
     assert first == second
-    assert first.startswith(b"\x89PNG")
-    assert b"Software" not in first
+
+
+def test_a_target_gets_the_figures_its_project_can_tell() -> None:
+    every = figures.target_figures(history(), INTERVALS, Drift(), comparison=comparison())
+    assert set(every) == {"displacement", "orbit", "pre_event", "corner_sweep", "corner_effect", "gps"}
+    assert set(figures.target_figures(history(), Intervals(), Drift())) == {"displacement", "orbit"}
+    assert set(figures.target_figures(history("lost"), INTERVALS, Drift())) == {"displacement", "orbit"}
 
 
 def test_svg_has_no_date_and_is_the_same_twice(tmp_path: Path) -> None:
