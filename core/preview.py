@@ -1,0 +1,187 @@
+"""What the engine sees in a target's search bands, in the reference frame: shown while a person draws them.
+
+The very functions that measure the frames later find the edges here, so what is drawn is what will be followed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from core.coordinates import Floats, read_only
+from core.errors import InputError
+from core.following import make_follower
+from core.georeference import ReferenceFit
+from core.motion import fit_line
+from core.project import LINE_NAMES, Band, Target
+from core.roof_lines import LineTracker
+from core.video import Luma
+
+# Points of a band's long side, which the lens bends in the raw frame.
+_SIDE_POINTS = 17
+
+
+@dataclass(frozen=True, eq=False)
+class LinePreview:
+    """One search band and the roof line found in it; plan metres and raw pixels of the reference frame.
+
+    Attributes:
+        band_plan: (4, 2) corners.
+        band_raw: (2 * 17, 2) its outline.
+        edges_plan, edges_raw: (N, 2, 2) both edges at each station where they were found.
+        midline_plan, midline_raw: (2, 2) ends of the fitted line within the band; None where none was found.
+        rms_px: of the stations' middles about the fitted line.
+        message: why there is no line; empty where there is one.
+    """
+
+    band_plan: Floats
+    band_raw: Floats
+    edges_plan: Floats
+    edges_raw: Floats
+    midline_plan: Floats | None
+    midline_raw: Floats | None
+    rms_px: float | None
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class PointPreview:
+    """P1 or P2: where it appears on the ground, in the raw frame, and where it is at the target's height."""
+
+    plan_m: Floats
+    raw_px: Floats
+    world_m: Floats | None
+
+
+@dataclass(frozen=True, eq=False)
+class TargetPreview:
+    """A target as it is found in the reference frame.
+
+    Attributes:
+        lines: by name; empty for a points target.
+        points_plan, points_raw: (N, 2) patches of a points target; empty for a lines target.
+        region_raw: (M, 2) outline of a points target.
+        p1, p2: the points whose displacement is reported; None where their lines were not found.
+        message: what is wrong with the target as a whole; empty where nothing is.
+    """
+
+    lines: Mapping[str, LinePreview]
+    points_plan: Floats
+    points_raw: Floats
+    region_raw: Floats
+    p1: PointPreview | None
+    p2: PointPreview | None
+    message: str
+
+
+def preview_target(luma: Luma, target: Target, fit: ReferenceFit) -> TargetPreview:
+    """Return what is found of a target in the reference frame; what is not found is said in words.
+
+    Args:
+        luma: the reference frame.
+        target: with its bands or its region.
+        fit: of the clicked pairs.
+    """
+    if target.kind == "points" or target.lines is None:
+        return _preview_points(luma, target, fit)
+    lines = {
+        name: _preview_line(luma, getattr(target.lines, name), fit, f"targets.{target.name}.lines.{name}")
+        for name in LINE_NAMES
+    }
+    p1, p2 = (_crossing(lines[name], lines["T1"], target, fit) for name in ("L1", "L2"))
+    message = ""
+    if p1 and p2 and target.p1_p2_m is not None and p1.world_m is not None and p2.world_m is not None:
+        distance_m = float(np.linalg.norm(p1.world_m - p2.world_m))
+        message = f"P1-P2 measures {distance_m:.3f} m; {target.p1_p2_m:.3f} m is given."
+    return TargetPreview(lines, np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2)), p1, p2, message)
+
+
+def _preview_line(luma: Luma, band: Band, fit: ReferenceFit, name: str) -> LinePreview:
+    ends = np.array([band.from_m, band.to_m])
+    band_plan = _corners(ends, band.width_m)
+    sides = np.concatenate([_between(*band_plan[:2]), _between(*band_plan[2:])])
+    band_raw = fit.raw_from_plan(sides)
+    none = LinePreview(band_plan, band_raw, np.empty((0, 2, 2)), np.empty((0, 2, 2)), None, None, None, "")
+    try:
+        edges_raw = _edges(luma, ends, band, fit, name)
+    except InputError as error:
+        return _without_line(none, str(error))
+    edges_raw = edges_raw[np.isfinite(edges_raw).all(axis=(1, 2))]
+    if len(edges_raw) < 4:
+        return _without_line(none, f"{name} shows too few edge points; draw the band along a clearer stretch")
+    edges_plan = fit.plan_from_raw(edges_raw.reshape(-1, 2)).reshape(edges_raw.shape)
+    middle_raw = edges_raw.mean(axis=1)
+    middle_plan = fit.plan_from_raw(middle_raw)
+    normal, offset = fit_line(middle_plan, np.ones(len(middle_plan)), ends[0])
+    across_m = (middle_plan - ends[0]) @ normal - offset
+    midline = ends - np.outer((ends - ends[0]) @ normal - offset, normal)
+    pixels_per_m = np.linalg.norm(np.diff(fit.raw_from_plan(ends), axis=0)) / np.linalg.norm(np.diff(ends, axis=0))
+    return LinePreview(
+        band_plan=band_plan,
+        band_raw=band_raw,
+        edges_plan=read_only(edges_plan),
+        edges_raw=read_only(edges_raw),
+        midline_plan=read_only(midline),
+        midline_raw=read_only(fit.raw_from_plan(midline)),
+        rms_px=float(np.sqrt(np.mean(across_m**2)) * pixels_per_m),
+        message="",
+    )
+
+
+def _without_line(none: LinePreview, message: str) -> LinePreview:
+    return LinePreview(
+        none.band_plan, none.band_raw, none.edges_plan, none.edges_raw, None, None, None, message.rstrip(".") + "."
+    )
+
+
+def _edges(luma: Luma, ends: Floats, band: Band, fit: ReferenceFit, name: str) -> Floats:
+    """Return (STATIONS, 2, 2) both edges at each station, raw pixels, nan where not found."""
+    raw = fit.raw_from_plan(ends)
+    if not np.isfinite(raw).all():
+        raise InputError(f"{name} lies outside the reference frame; move it onto the roof")
+    across = (ends[1] - ends[0])[::-1] * [-1.0, 1.0] / np.linalg.norm(ends[1] - ends[0])
+    middle = ends.mean(axis=0)
+    beside = fit.raw_from_plan(np.stack([middle - across * band.width_m / 2, middle + across * band.width_m / 2]))
+    width_px = float(np.linalg.norm(beside[1] - beside[0]))
+    tracker = LineTracker(luma, fit.rays_from_plan(ends), fit.lens.raw_from_rays, width_px=width_px, name=name)
+    return tracker.find(luma, fit.lens.raw_from_rays).edges_raw
+
+
+def _corners(ends: Floats, width_m: float) -> Floats:
+    """Return (4, 2) corners of a band, going round."""
+    along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    half = np.array([-along[1], along[0]]) * width_m / 2
+    return read_only(np.stack([ends[0] + half, ends[1] + half, ends[1] - half, ends[0] - half]))
+
+
+def _between(start: Floats, end: Floats) -> Floats:
+    return np.asarray(start + np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None] * (end - start))
+
+
+def _crossing(line: LinePreview, across: LinePreview, target: Target, fit: ReferenceFit) -> PointPreview | None:
+    if line.midline_plan is None or across.midline_plan is None:
+        return None
+    (a, b), (c, d) = line.midline_plan, across.midline_plan
+    directions = np.column_stack([b - a, c - d])
+    if abs(np.linalg.det(directions)) < 1e-9:
+        return None
+    plan = a + np.linalg.solve(directions, c - a)[0] * (b - a)
+    return _point(plan, target, fit)
+
+
+def _point(plan: Floats, target: Target, fit: ReferenceFit) -> PointPreview:
+    world = None
+    if fit.pose is not None and target.height_m is not None:
+        world = read_only(fit.world_from_plan(plan[None], target.height_m)[0])
+    return PointPreview(read_only(plan), read_only(fit.raw_from_plan(plan[None])[0]), world)
+
+
+def _preview_points(luma: Luma, target: Target, fit: ReferenceFit) -> TargetPreview:
+    region_raw = fit.raw_from_plan(np.array(target.region_m))
+    try:
+        raw = make_follower(luma, target, fit.rays_from_plan, fit.lens).reference_raw
+    except InputError as error:
+        return TargetPreview({}, np.empty((0, 2)), np.empty((0, 2)), region_raw, None, None, str(error))
+    return TargetPreview({}, fit.plan_from_raw(raw), read_only(raw), region_raw, None, None, "")
