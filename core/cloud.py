@@ -565,7 +565,7 @@ def _local_planes(offsets: Floats, heights: Floats, owner: NDArray[np.int64], ra
         weight = nearness * np.clip(1.0 - (off / (4.7 * scale[owner])) ** 2, 0.0, None) ** 2
         products = weight[:, None, None] * design[:, :, None] * design[:, None, :]
         sums = [np.bincount(owner, product, count) for product in products.reshape(-1, 9).T]
-        normal: Floats = np.stack(sums, axis=1).reshape(-1, 3, 3)
+        normal: Floats = np.asarray(np.stack(sums, axis=1), dtype=np.float64).reshape(-1, 3, 3)
         right = np.stack([np.bincount(owner, weight * d * heights, count) for d in design.T], axis=1)
         # Points on one side or in one line do not tell the slope: a little stiffness keeps it level there.
         normal = normal + np.diag([0.0, 0.02, 0.02]) * normal[:, :1, :1] + 1e-12 * np.eye(3)

@@ -54,6 +54,15 @@ def invert_homography(H: ArrayLike) -> Floats:
     return inverse / inverse[2, 2]
 
 
+def finite_median(values: Floats) -> Floats:
+    """Return the median of what is finite along the last axis; 0 where nothing is. Quicker than numpy's own."""
+    ordered = np.sort(np.where(np.isfinite(values), values, np.inf), axis=-1)
+    count = np.isfinite(ordered).sum(axis=-1, keepdims=True)
+    low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=-1)
+    high = np.take_along_axis(ordered, np.minimum(count // 2, ordered.shape[-1] - 1), axis=-1)
+    return np.asarray(np.where(count > 0, 0.5 * (low + high), 0.0)[..., 0])
+
+
 def rotation_2d(angle_rad: float) -> Floats:
     """Return the (2, 2) matrix that turns plane vectors counter-clockwise by an angle."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
@@ -95,4 +104,4 @@ class OrthoGrid:
     @property
     def H_ortho_world(self) -> Floats:
         """(3, 3) from metres to pixel centres."""
-        return np.linalg.inv(self.H_world_ortho)
+        return np.asarray(np.linalg.inv(self.H_world_ortho), dtype=np.float64)

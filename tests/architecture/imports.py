@@ -42,6 +42,7 @@ ORDER = (
     "measurements",
     "paper",
     "measure",
+    "preview",
     "solve",
     "figures",
     "report",
@@ -51,7 +52,7 @@ ORDER = (
 )
 # Steps of the measurement: others may know what they return, only conductors call them.
 STEPS = {"georeference", "ground", "roof_lines", "roof_points", "motion", "flight", "drift", "validation"}
-CONDUCTORS = {"following", "paper", "measure", "solve", "figures", "report", "check", "run"}
+CONDUCTORS = {"following", "paper", "measure", "preview", "solve", "figures", "report", "check", "run"}
 
 # Libraries that enter the program through one door only; the sample is rendered outside of it.
 DOORS = {
