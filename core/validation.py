@@ -215,9 +215,9 @@ def compare_with_gps(
     """Return how the video's displacement compares with GPS, after setting the GPS clock.
 
     The lag is found where the two velocities correlate best (velocities know neither baseline nor slow drift), then
-    refined to the least RMS difference of the displacements, the video interpolated by cubic splines. The
-    GPS displacement is taken from its mean over the pre-event; without one, from the video's mean over all samples,
-    which is said.
+    refined to the least RMS difference of the displacements or of their changes, whichever tells it better, the video
+    interpolated by cubic splines. The GPS displacement is taken from its mean over the pre-event; without one, from
+    the video's mean over all samples, which is said.
 
     Args:
         time_s: (F,) of the frames.
@@ -312,8 +312,14 @@ def _lag(video: _Video, gps: GpsRecord, max_lag_s: float | None) -> tuple[float,
     higher = (correlations >= 0.9 * best) & _local_maxima(correlations)
     coarse = np.flatnonzero(higher)[np.argsort(correlations[higher])[::-1][:5]]
     step_s = float(lags_s[1] - lags_s[0]) if len(lags_s) > 1 else 0.1
-    refined = [_refined(video, gps, float(lags_s[place]), step_s) for place in coarse]
-    lag_s, sigma_s, _ = min(refined, key=lambda result: result[2])
+    lag_s, sigma_s = min(
+        (
+            _refined(video, gps, float(lags_s[place]), step_s, differenced=differenced)
+            for place in coarse
+            for differenced in (False, True)
+        ),
+        key=lambda result: result[1],
+    )
     return lag_s, sigma_s, best
 
 
@@ -348,25 +354,34 @@ def _local_maxima(values: Floats) -> Bools:
     return np.asarray((values >= padded[:-2]) & (values >= padded[2:]), dtype=np.bool_)
 
 
-def _refined(video: _Video, gps: GpsRecord, coarse_s: float, step_s: float) -> tuple[float, float, float]:
-    """Return the lag of least RMS difference near a coarse one, its standard deviation, and that RMS."""
+def _refined(
+    video: _Video, gps: GpsRecord, coarse_s: float, step_s: float, *, differenced: bool
+) -> tuple[float, float]:
+    """Return the lag of least RMS difference near a coarse one, and its standard deviation.
+
+    Displacements tell the lag best where their difference is noise. Where it is camera drift, the change from one GPS
+    sample to the next (`differenced`) tells it better, since drift is slow. The smaller standard deviation decides.
+    """
     coarse_times = gps.time_s + coarse_s
+
+    def compared(values: Floats) -> Floats:
+        change = np.diff(values, axis=0) if differenced else values
+        return change[np.isfinite(change).all(axis=1)]
 
     # Measured from the coarse lag: clocks may differ by weeks, and the minimiser's tolerance grows with the number.
     def rms(correction_s: float) -> float:
-        difference = video.at(coarse_times + correction_s) - gps.position_m
-        if np.isfinite(difference).sum() < 8:
-            return math.inf
-        return float(np.sqrt(np.nanmean((difference - np.nanmean(difference, axis=0)) ** 2)))
+        difference = compared(video.at(coarse_times + correction_s) - gps.position_m)
+        return float(np.sqrt(np.mean((difference - difference.mean(axis=0)) ** 2))) if len(difference) > 3 else math.inf
 
     trials_s = np.linspace(-1.5 * step_s, 1.5 * step_s, 13)
     start = int(np.argmin([rms(float(trial)) for trial in trials_s]))
     bounds = float(trials_s[max(start - 1, 0)]), float(trials_s[min(start + 1, 12)])
     found = minimize_scalar(rms, bounds=bounds, method="bounded", options={"xatol": 1e-6})
-    lag_s, least = coarse_s + float(found.x), float(found.fun)
-    velocity = np.asarray(video.curve(gps.time_s + lag_s, 1), dtype=np.float64)
-    velocity = velocity[np.isfinite(video.at(gps.time_s + lag_s)).all(axis=1)]
-    return lag_s, least / max(math.sqrt(float(np.sum(velocity**2))), 1e-12), least
+    best_times = coarse_times + float(found.x)
+    # NaN where the video was not measured, as in the difference.
+    velocity = np.asarray(video.curve(best_times, 1), dtype=np.float64) + 0 * video.at(best_times)
+    sensitivity = math.sqrt(float(np.sum(compared(velocity) ** 2)))
+    return coarse_s + float(found.x), float(found.fun) / max(sensitivity, 1e-12)
 
 
 def _baseline(sample_s: Floats, sample_m: Floats, video_m: Floats, intervals: Intervals) -> tuple[Floats, str]:

@@ -58,6 +58,19 @@ def test_lag_survives_drift_offset_and_lost_frames() -> None:
     assert np.isfinite(comparison.video_m[~lost]).sum() > 500
 
 
+def test_lag_of_a_small_motion_under_a_large_drift() -> None:
+    """Three centimetres of shaking under ten of drift, where the displacements agree best seconds away."""
+    time_s, moved = video()
+    small = moved * [0.08, 1.0]
+    drift = 0.1 * np.column_stack([np.sin(0.9 * time_s), np.cos(0.6 * time_s)])
+    record = gps_with_lag(12.3)
+    quiet = GpsRecord("gps.csv", record.time_s, (record.position_m - ORIGIN_M) * [0.08, 1.0])
+    comparison = compare_with_gps(time_s, small + drift, quiet, INTERVALS)
+    assert comparison.lag_sigma_s is not None
+    assert comparison.lag_s == pytest.approx(12.3, abs=5 * comparison.lag_sigma_s)
+    assert comparison.lag_sigma_s < 0.03
+
+
 def test_rows_are_those_of_table_2() -> None:
     time_s, moved = video()
     scaled = moved * 0.95
