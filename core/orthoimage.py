@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -322,42 +321,6 @@ def read_grid(path: Path | str) -> OrthoGrid:
     except FileNotFoundError:
         raise InputError(f"{path}: not found; make the orthoimage first.") from None
     except (OSError, ValueError, KeyError, IndexError, tifffile.TiffFileError) as error:
-        raise InputError(f"{path}: is no orthoimage of this program ({error}); make it again.") from None
-
-
-def read_grid(path: Path | str) -> OrthoGrid:
-    """Return where the pixels of a georeferenced TIFF lie, without reading them.
-
-    Raises:
-        InputError: the file is missing or is no TIFF of ours.
-    """
-    with _georeferenced(path) as (grid, _):
-        return grid
-
-
-def read_geotiff(path: Path | str) -> tuple[OrthoGrid, Pixels]:
-    """Return raster and pixels (height, width, 4) red, green, blue, opacity of a TIFF that `write_geotiff` made.
-
-    Raises:
-        InputError: as `read_grid`.
-    """
-    with _georeferenced(path) as (grid, page):
-        return grid, np.asarray(page.asarray(), dtype=np.uint8)
-
-
-@contextmanager
-def _georeferenced(path: Path | str) -> Iterator[tuple[OrthoGrid, tifffile.TiffPage]]:
-    try:
-        with tifffile.TiffFile(path) as file:
-            page = file.pages.first
-            scale, tie = page.tags[33550].value, page.tags[33922].value
-            if page.shape[2:] != (4,):
-                raise ValueError(f"{page.shape} is no picture with opacity")
-            west_m, north_m = tie[3] - tie[0] * scale[0], tie[4] + tie[1] * scale[1]
-            yield OrthoGrid(west_m, north_m, scale[0], page.shape[1], page.shape[0]), page
-    except FileNotFoundError:
-        raise InputError(f"{path}: not found; make the orthoimage first.") from None
-    except (OSError, tifffile.TiffFileError, KeyError, ValueError, IndexError) as error:
         raise InputError(f"{path}: is no orthoimage of this program ({error}); make it again.") from None
 
 
