@@ -26,6 +26,8 @@ from core.project import GpsInput, Intervals
 
 # Velocities of the same motion correlate above 0.9; of two records of noise, below 0.3 at every lag tried.
 _LEAST_CORRELATION = 0.5
+# Of lags a period apart under heavy drift, the wrong one was taken only where it fitted within this of the right one.
+_RIVAL = 1.2
 # A GPS time is compared where the video was measured on both sides, not farther apart than this many frames.
 _BRIDGED_FRAMES = 3.5
 
@@ -232,13 +234,8 @@ def compare_with_gps(
     times = np.asarray(time_s, dtype=np.float64)
     moved = np.asarray(displacement_m, dtype=np.float64)
     video = _Video.of(times, moved)
-    lag_s, lag_sigma_s, correlation = _lag(video, gps, max_lag_s)
-    message = ""
-    if lag_sigma_s is None:
-        message = (
-            f"The clock lag of {gps.name} could not be told, because video and GPS show no motion in common "
-            f"(correlation {correlation:.2f}); the records are compared as if their clocks agreed."
-        )
+    lag = _lag(video, gps, max_lag_s)
+    lag_s = lag.lag_s
     shared = within(gps.time_s + lag_s, (float(video.times[0]), float(video.times[-1])))
     sample_s, sample_m = gps.time_s[shared] + lag_s, gps.position_m[shared]
     video_m = video.at(sample_s)
@@ -253,9 +250,9 @@ def compare_with_gps(
     error_m = video_m - sample_m
     return GpsComparison(
         lag_s=lag_s,
-        lag_sigma_s=lag_sigma_s,
-        correlation=correlation,
-        message=" ".join(sentence for sentence in (message, without_rest) if sentence),
+        lag_sigma_s=lag.sigma_s,
+        correlation=lag.correlation,
+        message=" ".join(sentence for sentence in (lag.doubt(gps.name), without_rest) if sentence),
         time_s=read_only(sample_s),
         gps_m=read_only(sample_m),
         video_m=read_only(video_m),
@@ -299,28 +296,55 @@ class _Video:
         return values
 
 
-def _lag(video: _Video, gps: GpsRecord, max_lag_s: float | None) -> tuple[float, float | None, float]:
-    """Return the lag, its standard deviation (None where it could not be told), and the correlation there."""
+@dataclass(frozen=True)
+class _Lag:
+    """The clocks' difference, its standard deviation (None where it could not be told), and what else fits."""
+
+    lag_s: float
+    sigma_s: float | None
+    correlation: float
+    rival_s: float | None = None
+
+    def doubt(self, name: str) -> str:
+        """Say in a sentence what is uncertain; empty where nothing is."""
+        if self.sigma_s is None:
+            return (
+                f"The clock lag of {name} could not be told, because video and GPS show no motion in common "
+                f"(correlation {self.correlation:.2f}); the records are compared as if their clocks agreed."
+            )
+        if self.rival_s is not None:
+            return (
+                f"The clock lag of {name} is in doubt: {self.rival_s:.2f} s fits nearly as well as {self.lag_s:.2f} s, "
+                "because the motion repeats itself; compare a result with less drift, or a longer record."
+            )
+        return ""
+
+
+def _lag(video: _Video, gps: GpsRecord, max_lag_s: float | None) -> _Lag:
     lags_s, correlations = _correlations(video, gps)
     if max_lag_s is not None:
         considered = np.abs(lags_s) <= max_lag_s
         lags_s, correlations = lags_s[considered], correlations[considered]
     best = float(correlations.max(initial=-1.0))
     if best < _LEAST_CORRELATION:
-        return 0.0, None, best
+        return _Lag(0.0, None, best)
     # Regular shaking correlates nearly as well a period earlier or later: every good peak is refined, the best kept.
     higher = (correlations >= 0.9 * best) & _local_maxima(correlations)
     coarse = np.flatnonzero(higher)[np.argsort(correlations[higher])[::-1][:5]]
     step_s = float(lags_s[1] - lags_s[0]) if len(lags_s) > 1 else 0.1
-    lag_s, sigma_s = min(
-        (
-            _refined(video, gps, float(lags_s[place]), step_s, differenced=differenced)
-            for place in coarse
-            for differenced in (False, True)
-        ),
-        key=lambda result: result[1],
-    )
-    return lag_s, sigma_s, best
+    refined = [
+        min(
+            (
+                _refined(video, gps, float(lags_s[place]), step_s, differenced=differenced)
+                for differenced in (False, True)
+            ),
+            key=lambda result: result[1],
+        )
+        for place in coarse
+    ]
+    (lag_s, sigma_s), *others = sorted(refined, key=lambda result: result[1])
+    rivals = [other_s for other_s, other in others if other < _RIVAL * sigma_s and abs(other_s - lag_s) > 2 * step_s]
+    return _Lag(lag_s, sigma_s, best, rivals[0] if rivals else None)
 
 
 def _correlations(video: _Video, gps: GpsRecord) -> tuple[Floats, Floats]:

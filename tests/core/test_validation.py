@@ -71,6 +71,23 @@ def test_lag_of_a_small_motion_under_a_large_drift() -> None:
     assert comparison.lag_sigma_s < 0.03
 
 
+def test_doubt_between_two_periods_is_said() -> None:
+    """Steady shaking all through both records looks the same a period later."""
+    time_s = np.arange(900) / 30
+    rng = np.random.default_rng(8)
+    clock_s = np.arange(-10, 40, 0.1)
+    moved, position = (
+        np.column_stack([0.1 * np.sin(2 * np.pi * 0.5 * at_s), np.zeros(len(at_s))])
+        + rng.normal(scale=NOISE_M, size=(len(at_s), 2))
+        for at_s in (time_s, clock_s)
+    )
+    comparison = compare_with_gps(time_s, moved, GpsRecord("gps.csv", clock_s, position), INTERVALS)
+    assert "clock lag of gps.csv is in doubt" in comparison.message
+    assert comparison.lag_s % 2.0 == pytest.approx(0.0, abs=0.01) or comparison.lag_s % 2.0 == pytest.approx(
+        2.0, abs=0.01
+    )
+
+
 def test_rows_are_those_of_table_2() -> None:
     time_s, moved = video()
     scaled = moved * 0.95
