@@ -7,7 +7,7 @@ import { projectPath } from "./api.js";
 /**
  * @typedef {object} ServerEvents
  * @property {{revision: number, job: import("./types.js").Job | null}} hello
- * @property {{job: import("./types.js").Job}} job
+ * @property {import("./types.js").Job} job
  * @property {{revision: number, label?: string}} project
  * @property {{kind: string}} inputs
  * @property {{ready: boolean}} orthoimage
