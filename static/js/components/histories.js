@@ -1,0 +1,71 @@
+// Measured histories as the server tells them, and the words for methods, axes and statuses.
+
+import { get, projectPath } from "../lib/api.js";
+
+/** @typedef {"geometric" | "paper"} Method */
+/** @typedef {(number | null)[]} Column null where nothing was measured */
+
+/**
+ * @typedef {object} History one target by one method; columns named as in its CSV
+ * @property {number[]} frame
+ * @property {number[]} time_s
+ * @property {string[]} status
+ * @property {Column} p1_dx_m
+ * @property {Column} p1_dy_m
+ * @property {Column} p2_dx_m
+ * @property {Column} p2_dy_m
+ * @property {Column} rotation_rad
+ * @property {Column} p1_dx_sigma_m
+ * @property {Column} p1_dy_sigma_m
+ * @property {Column} p2_dx_sigma_m
+ * @property {Column} p2_dy_sigma_m
+ * @property {Column} p1_dx_raw_m
+ * @property {Column} p1_dy_raw_m
+ * @property {Column} p2_dx_raw_m
+ * @property {Column} p2_dy_raw_m
+ *
+ * @typedef {object} ResultFile
+ * @property {string} name
+ * @property {number} size bytes
+ * @property {number} [modified_s]
+ *
+ * @typedef {object} Results
+ * @property {boolean} ready
+ * @property {boolean} stale
+ * @property {any} summary the engine's summary.json
+ * @property {string[]} targets
+ * @property {Method[]} methods
+ * @property {ResultFile[]} files
+ */
+
+/** @type {{value: Method, name: string, line: string}[]} */
+export const METHODS = [
+  { value: "geometric", name: "Geometric", line: "Camera pose of every frame from the tracked ground, roof lines cut at the roof's own height: no parallax, no filter, the residual stays." },
+  { value: "paper", name: "Paper", line: "The published method: ground homography, scale from P1–P2, high-pass against the drift that is left. Needs no lens and no height." },
+];
+
+/** @param {string} method */
+export const methodName = (method) => METHODS.find((entry) => entry.value === method)?.name ?? method;
+
+/** @type {{value: "x" | "y", name: string, title: string}[]} */
+export const AXES = [
+  { value: "x", name: "East (x)", title: "East displacement, x" },
+  { value: "y", name: "North (y)", title: "North displacement, y" },
+];
+
+const STATUS_ORDER = ["ok", "weak", "lost", "excluded"];
+
+/** @param {string} id @returns {Promise<Results>} */
+export const fetchResults = (id) => get(projectPath(id, "results"));
+
+/** @param {string} id @param {string} target @param {string} [method] @returns {Promise<History>} */
+export async function fetchHistory(id, target, method) {
+  const answer = await get(projectPath(id, `results/${encodeURIComponent(target)}`, { method }));
+  return answer.columns ?? answer;
+}
+
+/** Per frame the worst status of several targets. @param {string[][]} lists @returns {string[]} */
+export function worstStatuses(lists) {
+  const [first = [], ...others] = lists;
+  return first.map((status, i) => others.reduce((worst, list) => (STATUS_ORDER.indexOf(list[i]) > STATUS_ORDER.indexOf(worst) ? list[i] : worst), status));
+}

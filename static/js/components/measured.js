@@ -1,0 +1,38 @@
+// Pages that show results wait here until there are any.
+
+import { fill, find, h } from "../lib/dom.js";
+import { icon } from "../lib/icons.js";
+import { stepUrl } from "./header.js";
+import { fetchResults } from "./histories.js";
+import { toastError } from "./toast.js";
+
+/** @typedef {import("./histories.js").Results} Results */
+
+/**
+ * The results, at once or as soon as there are some; until then the page says what is missing.
+ * @param {import("./page.js").Page} page
+ * @param {string} what it will be good for
+ * @returns {Promise<Results>}
+ */
+export async function whenMeasured(page, what) {
+  const main = find("#main");
+  const layout = main.className;
+  for (;;) {
+    const results = await fetchResults(page.id).catch((error) => (toastError(error), null));
+    if (results?.ready) {
+      main.className = layout;
+      return results;
+    }
+    main.className = "page";
+    fill(main, emptyState(page.id, what));
+    await new Promise((resolve) => page.events.on("results", () => resolve(null)));
+  }
+}
+
+/** @param {string} id @param {string} what */
+function emptyState(id, what) {
+  return h("div", { class: "empty-state" },
+    h("h1", {}, "Nothing measured yet"),
+    h("p", {}, what),
+    h("a", { class: "button primary", href: stepUrl(id, "track") }, "Go to Track", icon("arrow_right")));
+}

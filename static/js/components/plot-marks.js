@@ -1,0 +1,237 @@
+// What lies on a plot besides its curves: intervals with handles, labelled places, and the status of each frame.
+
+import { decorate, h } from "../lib/dom.js";
+
+/** @typedef {import("./plot.js").Plot} Plot */
+/** @typedef {import("./plot.js").Interval} Interval */
+
+/** @type {Record<string, string>} */
+const STATUS_COLOURS = { weak: "--warn", lost: "--bad", excluded: "--text-faint" };
+const STRIP_PX = 6;
+
+/**
+ * Fill the intervals behind the curves.
+ * @param {Plot} plot
+ * @param {import("../../vendor/uplot/uPlot.esm.js")} u
+ */
+export function drawIntervals(plot, u) {
+  const { left, top, width, height } = u.bbox;
+  const g = u.ctx;
+  const scale = devicePixelRatio;
+  g.save();
+  g.beginPath();
+  g.rect(left, top, width, height);
+  g.clip();
+  for (const interval of plot.intervals) {
+    const from = u.valToPos(interval.from, "x", true);
+    const to = u.valToPos(interval.to, "x", true);
+    g.fillStyle = plot.faded(interval.colour, 0.08);
+    g.fillRect(from, top, to - from, height);
+    g.fillStyle = plot.faded(interval.colour, 0.6);
+    g.fillRect(from, top, scale, height);
+    g.fillRect(to - scale, top, scale, height);
+    g.fillStyle = plot.colour(interval.colour);
+    g.font = `600 ${11 * scale}px Inter, system-ui, sans-serif`;
+    g.textBaseline = "top";
+    g.textAlign = "left";
+    if (to - from > g.measureText(interval.label).width + 12 * scale) g.fillText(interval.label, Math.max(from, left) + 7 * scale, top + 5 * scale);
+  }
+  g.restore();
+}
+
+/**
+ * Draw labelled places over the curves.
+ * @param {Plot} plot
+ * @param {import("../../vendor/uplot/uPlot.esm.js")} u
+ */
+export function drawVerticals(plot, u) {
+  const { left, top, width, height } = u.bbox;
+  const g = u.ctx;
+  const scale = devicePixelRatio;
+  g.save();
+  g.font = `600 ${11 * scale}px Inter, system-ui, sans-serif`;
+  g.textBaseline = "top";
+  g.textAlign = "left";
+  plot.verticals.forEach((vertical, i) => {
+    const x = u.valToPos(vertical.at, "x", true);
+    if (x < left || x > left + width) return;
+    g.fillStyle = g.strokeStyle = plot.colour(vertical.colour);
+    g.lineWidth = 1.5 * scale;
+    g.setLineDash(i % 2 ? [4 * scale, 3 * scale] : []);
+    g.beginPath();
+    g.moveTo(x, top);
+    g.lineTo(x, top + height);
+    g.stroke();
+    const wide = g.measureText(vertical.label).width + 8 * scale;
+    const neighbour = plot.verticals.some((other) => other.at > vertical.at && u.valToPos(other.at, "x", true) < x + wide);
+    const after = (x + wide < left + width && !neighbour) || x - wide < left;
+    g.fillText(vertical.label, after ? x + 6 * scale : x - wide + 2 * scale, top + 5 * scale);
+  });
+  g.restore();
+}
+
+/**
+ * Mark weak, lost and excluded frames: a strip along the foot, and a faint column where there is nothing to draw.
+ * Told apart by height and hatching as well as by colour.
+ * @param {Plot} plot
+ * @param {import("../../vendor/uplot/uPlot.esm.js")} u
+ */
+export function drawStatuses(plot, u) {
+  const { left, top, width, height } = u.bbox;
+  const x = u.data[0] ?? [];
+  const g = u.ctx;
+  const strip = STRIP_PX * devicePixelRatio;
+  g.save();
+  g.beginPath();
+  g.rect(left, top, width, height);
+  g.clip();
+  for (const run of statusRuns(plot.statuses, x.length)) {
+    const from = u.valToPos(Number(x[run.first]), "x", true);
+    const to = u.valToPos(Number(x[Math.min(run.last + 1, x.length - 1)]), "x", true);
+    if (to < left || from > left + width) continue;
+    const wide = Math.max(to - from, 2 * devicePixelRatio);
+    const name = STATUS_COLOURS[run.status];
+    if (!name) continue;
+    g.fillStyle = plot.colour(name);
+    g.fillRect(from, top + height - strip, wide, run.status === "weak" ? strip / 2 : strip);
+    if (run.status === "weak") continue;
+    g.fillStyle = plot.faded(name, 0.12);
+    g.fillRect(from, top, wide, height);
+    if (run.status === "excluded") hatch(g, { from, wide, top, height, colour: plot.faded(name, 0.45) });
+  }
+  g.restore();
+}
+
+/**
+ * @param {string[]} statuses
+ * @param {number} count
+ * @returns {{status: string, first: number, last: number}[]} runs of equal status other than "ok"
+ */
+export function statusRuns(statuses, count = statuses.length) {
+  /** @type {{status: string, first: number, last: number}[]} */
+  const runs = [];
+  for (let i = 0; i < Math.min(statuses.length, count); i++) {
+    const status = /** @type {string} */ (statuses[i]);
+    const last = runs.at(-1);
+    if (last && last.status === status && last.last === i - 1) last.last = i;
+    else if (status !== "ok") runs.push({ status, first: i, last: i });
+  }
+  return runs;
+}
+
+/**
+ * @param {CanvasRenderingContext2D} g
+ * @param {{from: number, wide: number, top: number, height: number, colour: string}} area
+ */
+function hatch(g, { from, wide, top, height, colour }) {
+  const step = 7 * devicePixelRatio;
+  g.save();
+  g.beginPath();
+  g.rect(from, top, wide, height);
+  g.clip();
+  g.strokeStyle = colour;
+  g.lineWidth = devicePixelRatio;
+  g.beginPath();
+  for (let x = from - height; x < from + wide; x += step) {
+    g.moveTo(x, top + height);
+    g.lineTo(x + height, top);
+  }
+  g.stroke();
+  g.restore();
+}
+
+/** The ends of editable intervals as sliders: dragged by the pointer, moved by the arrow keys. */
+export class IntervalHandles {
+  /** @param {Plot} plot */
+  constructor(plot) {
+    this.plot = plot;
+    this.layer = h("div", { class: "plot-handles" });
+    /** @type {Map<string, HTMLElement>} */ this.handles = new Map();
+  }
+
+  place() {
+    const wanted = new Set();
+    for (const interval of this.plot.intervals) {
+      if (!interval.editable) continue;
+      for (const end of /** @type {const} */ (["from", "to"])) {
+        wanted.add(`${interval.key}/${end}`);
+        this.placeOne(interval, end);
+      }
+    }
+    for (const [name, handle] of this.handles) {
+      if (wanted.has(name)) continue;
+      handle.remove();
+      this.handles.delete(name);
+    }
+  }
+
+  /** @param {Interval} interval @param {"from"|"to"} end */
+  placeOne(interval, end) {
+    const name = `${interval.key}/${end}`;
+    const handle = this.handles.get(name) ?? this.make(interval.key, end);
+    this.handles.set(name, handle);
+    const [min, max] = this.plot.extent;
+    handle.hidden = interval[end] < min || interval[end] > max;
+    handle.style.transform = `translateX(${this.plot.u.valToPos(interval[end], "x")}px)`;
+    handle.style.setProperty("--handle-colour", `var(${interval.colour})`);
+    const [low, high] = this.plot.whole;
+    decorate(handle, {
+      "aria-label": `${end === "from" ? "Start" : "End"} of ${interval.label}`,
+      "aria-valuenow": interval[end].toFixed(2),
+      "aria-valuetext": `${interval[end].toFixed(2)} ${this.plot.options.xUnit ?? "s"}`,
+      "aria-valuemin": low,
+      "aria-valuemax": high,
+    });
+  }
+
+  /** @param {string} key @param {"from"|"to"} end @returns {HTMLElement} */
+  make(key, end) {
+    const handle = h("div", { class: "plot-handle", tabindex: 0, role: "slider", "data-end": end });
+    handle.addEventListener("pointerdown", (event) => {
+      event.stopPropagation();
+      event.preventDefault();
+      handle.focus();
+      handle.setPointerCapture(event.pointerId);
+    });
+    handle.addEventListener("pointermove", (event) => {
+      if (!handle.hasPointerCapture(event.pointerId)) return;
+      event.stopPropagation();
+      this.move(key, end, this.plot.u.posToVal(event.clientX - this.plot.u.over.getBoundingClientRect().left, "x"), false);
+    });
+    handle.addEventListener("pointerup", (event) => {
+      event.stopPropagation();
+      this.move(key, end, this.value(key, end), true);
+    });
+    handle.addEventListener("keydown", (event) => this.key(event, key, end));
+    this.layer.append(handle);
+    return handle;
+  }
+
+  /** @param {KeyboardEvent} event @param {string} key @param {"from"|"to"} end */
+  key(event, key, end) {
+    const direction = /** @type {Record<string, number>} */ ({ ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 })[event.key];
+    if (!direction) return;
+    event.preventDefault();
+    event.stopPropagation();
+    const step = event.shiftKey ? 1 : event.altKey ? 0.02 : 0.1;
+    this.move(key, end, this.value(key, end) + direction * step, true);
+  }
+
+  /** @param {string} key @param {"from"|"to"} end @returns {number} */
+  value(key, end) {
+    return this.plot.intervals.find((interval) => interval.key === key)?.[end] ?? 0;
+  }
+
+  /** @param {string} key @param {"from"|"to"} end @param {number} x @param {boolean} done */
+  move(key, end, x, done) {
+    const [low, high] = this.plot.whole;
+    const least = 0.02;
+    this.plot.setIntervals(this.plot.intervals.map((interval) => {
+      if (interval.key !== key) return interval;
+      const from = end === "from" ? Math.min(Math.max(x, low), interval.to - least) : interval.from;
+      const to = end === "to" ? Math.max(Math.min(x, high), interval.from + least) : interval.to;
+      this.plot.emit("interval", { key, from, to, done });
+      return { ...interval, from, to };
+    }));
+  }
+}

@@ -1,0 +1,75 @@
+// The 3-D scene beside the player: camera, frame and roof lines in step with it, motion exaggerated on request.
+
+import { post, projectPath } from "../lib/api.js";
+import { fill, h } from "../lib/dom.js";
+import { sentence } from "../lib/api.js";
+
+const LEAST_PAUSE_MS = 80;
+
+export class SceneView {
+  #active = false;
+  #sending = false;
+  /** @type {Record<string, number | boolean> | null} */
+  #waiting = null;
+
+  /** @param {HTMLElement} host @param {string} projectId */
+  constructor(host, projectId) {
+    this.host = host;
+    this.projectId = projectId;
+    this.amount = h("output", { class: "number", for: "exaggeration" }, "1×");
+    this.slider = h("input", { type: "range", id: "exaggeration", min: 0, max: 2, step: 0.05, value: 0, "aria-label": "Exaggeration of the roof's motion", oninput: () => this.#exaggerate() });
+    this.message = h("div", { class: "pane-note", hidden: true, role: "status" });
+    this.bar = h("div", { class: "scene-bar" }, h("label", { for: "exaggeration" }, "Motion"), this.slider, this.amount);
+    host.append(this.message, this.bar);
+  }
+
+  /** Open the scene when it is first seen. @param {boolean} active @param {number} frame */
+  setActive(active, frame) {
+    this.#active = active;
+    if (!active) return;
+    if (this.host.querySelector("iframe") === null) {
+      this.host.prepend(h("iframe", { class: "scene-frame", title: "3-D scene: cloud, camera and roof lines", src: "/viser/?hideViserLogo" }));
+    }
+    this.show({ frame, exaggeration: this.exaggeration });
+  }
+
+  /** 1 to 100, in even ratios along the slider. */
+  get exaggeration() {
+    return Number((10 ** Number(this.slider.value)).toPrecision(2));
+  }
+
+  /** Bring the scene up to the player; only the newest wish is sent. @param {Record<string, number | boolean>} wish */
+  show(wish) {
+    if (!this.#active) return;
+    this.#waiting = { ...this.#waiting, ...wish };
+    if (!this.#sending) void this.#send();
+  }
+
+  #exaggerate() {
+    this.amount.textContent = `${this.exaggeration}×`;
+    this.slider.setAttribute("aria-valuetext", `${this.exaggeration} times`);
+    this.show({ exaggeration: this.exaggeration });
+  }
+
+  async #send() {
+    this.#sending = true;
+    while (this.#waiting !== null) {
+      const wish = this.#waiting;
+      this.#waiting = null;
+      try {
+        const answer = await post(projectPath(this.projectId, "scene"), wish);
+        this.#tell(answer?.ready === false ? answer.message : "");
+      } catch (error) {
+        this.#tell(sentence(error));
+      }
+      await new Promise((resolve) => window.setTimeout(resolve, LEAST_PAUSE_MS));
+    }
+    this.#sending = false;
+  }
+
+  /** @param {string} words */
+  #tell(words) {
+    this.message.hidden = !words;
+    fill(this.message, words);
+  }
+}

@@ -1,0 +1,270 @@
+// Validate and export: the history against GPS, the rows of the paper's Table 2, and everything to take home.
+
+import { get, post, projectPath } from "../lib/api.js";
+import { fill, find, h } from "../lib/dom.js";
+import { centimetres, fixed, millimetres, size } from "../lib/format.js";
+import { icon } from "../lib/icons.js";
+import { setView, viewText } from "../lib/view-state.js";
+import { stepUrl } from "../components/header.js";
+import { AXES, fetchHistory, fetchResults } from "../components/histories.js";
+import { isRunning, jobCard } from "../components/job-card.js";
+import { whenMeasured } from "../components/measured.js";
+import { note } from "../components/notes.js";
+import { openPage } from "../components/page.js";
+import { Plot } from "../components/plot.js";
+import { segmented } from "../components/segmented.js";
+import { toast, toastError } from "../components/toast.js";
+
+/** @typedef {import("../components/histories.js").History} History */
+/** @typedef {import("../components/histories.js").ResultFile} ResultFile */
+/** @typedef {{time_s: number[], dx_m: (number | null)[], dy_m: (number | null)[]}} Curve */
+/** @typedef {"peak_positive" | "peak_negative" | "residual"} Quantity */
+/** @typedef {{quantity: Quantity, axis: "x" | "y", video_m: number, gps_m: number, error_m: number, error_percent: number | null}} TableRow */
+/** @typedef {{gps: Curve | null, video: Curve, error: Curve | null, lag_s: number | null, lag_sigma_s?: number | null, rms_m: {x: number, y: number} | null, table: TableRow[], message: string}} Validation */
+
+/** @type {{name: Quantity, title: string}[]} */
+const QUANTITIES = [
+  { name: "peak_positive", title: "Peak, positive" },
+  { name: "peak_negative", title: "Peak, negative" },
+  { name: "residual", title: "Residual" },
+];
+/** @type {{test: RegExp, words: string}[]} */
+const FILE_WORDS = [
+  { test: /\.csv$/, words: "Displacement history, a row per frame" },
+  { test: /^summary\.json$/, words: "Peaks, residual, fits, settings" },
+  { test: /^report\.html$/, words: "Report to read and print" },
+  { test: /^orthoimage\.tif$/, words: "Orthoimage, georeferenced" },
+  { test: /\.(png|svg|pdf)$/, words: "Figure" },
+];
+const NOT_FOR_PEOPLE = /^frames\.sqlite|^\./;
+
+const page = await openPage("export");
+let results = await whenMeasured(page, "Track the video first; the result is then compared with GPS and exported from here.");
+
+let axis = viewText("axis") === "y" ? "y" : "x";
+let target = results.targets.find((name) => name === viewText("target")) ?? results.targets[0] ?? "";
+/** @type {Validation | null} */
+let validation = null;
+/** @type {History | null} */
+let history = null;
+let problem = "";
+
+// the page
+const axisChoice = segmented({ label: "Axis", choices: AXES.map(({ value, name }) => ({ value, name })), value: axis, onChange: chooseAxis });
+const targetChoice = segmented({ label: "Target", choices: results.targets.map((name) => ({ value: name, name })), value: target, onChange: chooseTarget });
+targetChoice.element.hidden = results.targets.length < 2;
+const overlayBox = h("div", { class: "export-overlay" });
+const errorBox = h("div", { class: "export-error" });
+const tableBox = h("section", { class: "card export-table", "aria-label": "Peaks and residual" });
+const gpsBox = h("section", { class: "section", "aria-label": "GPS" });
+const fileBox = h("section", { class: "section", "aria-label": "Files" });
+const archiveBox = h("section", { class: "section", "aria-label": "Project archive" });
+fill(
+  find("#main"),
+  h("div", { class: "stage" },
+    h("div", { class: "stage-bar" }, h("h1", {}, "Validate and export"), targetChoice.element, h("span", { class: "spring" }), axisChoice.element),
+    h("div", { class: "stage-body export-stage" }, overlayBox, errorBox, tableBox)),
+  h("aside", { class: "side", "aria-label": "Validation and files" }, gpsBox, fileBox, archiveBox),
+);
+const overlay = new Plot(overlayBox, { title: "Displacement", unit: "m", link: "export", drag: "view" });
+const errorPlot = new Plot(errorBox, { title: "Video less GPS", unit: "m", link: "export", drag: "view" });
+const reportJob = jobCard();
+
+page.events.on("results", () => void reload().catch(toastError));
+page.events.on("job", onJob);
+page.keys([
+  { keys: "A", group: "Validate", label: "East or north", run: () => chooseAxis(axis === "x" ? "y" : "x") },
+  { keys: "D", group: "Export", label: "Download the displacement history", run: () => find("a[data-main]", HTMLAnchorElement).click() },
+  { keys: "Wheel", group: "Plots", label: "Zoom in time; a drag pans, a double click shows all" },
+]);
+showArchive();
+await reload().catch(toastError);
+
+async function reload() {
+  results = await fetchResults(page.id);
+  problem = "";
+  validation = null;
+  const { drift } = page.store.project;
+  const corner_hz = drift.filter === "high-pass" ? drift.corner_hz : null;
+  history = await fetchHistory(page.id, target);
+  if (page.store.project.inputs.gps !== null) {
+    validation = await get(projectPath(page.id, "validation", { target, corner_hz })).catch((error) => ((problem = error.message), null));
+  }
+  draw();
+  showGps();
+  showTable();
+  showFiles();
+}
+
+function draw() {
+  const key = axis === "x" ? "dx_m" : "dy_m";
+  const title = AXES.find((entry) => entry.value === axis)?.title ?? "";
+  find(".plot-title", HTMLElement, overlayBox).textContent = title;
+  const gps = validation?.gps;
+  errorBox.hidden = !gps || !validation?.error;
+  if (validation && gps) {
+    const [time, video, reference] = joined(validation.video, gps, key);
+    overlay.setTraces([{ label: "Video", colour: "--series-1", width: 1.6 }, { label: "GPS", colour: "--series-2", dash: [5, 3], width: 1.6 }], /** @type {any} */ ([time, video, reference]));
+    const { error } = validation;
+    if (error) errorPlot.setTraces([{ label: "Error", colour: "--series-4" }], [error.time_s, error[key]]);
+    const domain = /** @type {[number, number]} */ ([time[0], time.at(-1) ?? 1]);
+    overlay.setDomain(domain);
+    errorPlot.setDomain(domain);
+  } else if (history) {
+    overlay.setTraces([{ label: "P1", colour: "--series-1" }, { label: "P2", colour: "--series-3", dash: [6, 4] }], [history.time_s, history[`p1_${key}`], history[`p2_${key}`]]);
+    overlay.setStatuses(history.status);
+  }
+}
+
+/**
+ * Two records on one time axis. Where only the other one has a value: undefined, which the plot bridges;
+ * where one was not measured: null, which is a gap.
+ * @param {Curve} a
+ * @param {Curve} b
+ * @param {"dx_m" | "dy_m"} key
+ */
+function joined(a, b, key) {
+  const points = [...a.time_s.map((time, i) => ({ time, a: a[key][i], b: /** @type {number | null | undefined} */ (undefined) })), ...b.time_s.map((time, i) => ({ time, a: undefined, b: b[key][i] }))];
+  points.sort((one, other) => one.time - other.time);
+  return [points.map((entry) => entry.time), points.map((entry) => entry.a), points.map((entry) => entry.b)];
+}
+
+function showGps() {
+  const given = page.store.project.inputs.gps !== null;
+  const rms = validation?.rms_m;
+  const figure = (/** @type {string} */ value, /** @type {string} */ name) => h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
+  fill(
+    gpsBox,
+    h("header", {}, h("h2", {}, "Against GPS")),
+    given ? null : note("info", "No GPS record is given, so there is nothing to compare with. Peaks and residual below come from the video alone."),
+    given ? null : h("div", { class: "toolbar" }, h("a", { class: "button small", href: stepUrl(page.id, "inputs") }, "Add a GPS record")),
+    problem ? note("warn", problem) : null,
+    validation?.message ? note("warn", validation.message) : null,
+    validation?.gps && h("div", { class: "figures" },
+      figure(rms ? millimetres(rms.x, 1) : "–", "RMS error, east"),
+      figure(rms ? millimetres(rms.y, 1) : "–", "RMS error, north"),
+      figure(lagWords(validation), "clock lag, applied")),
+    validation?.gps ? h("p", { class: "small soft" }, lagSentence(validation.lag_s)) : null,
+  );
+}
+
+/** @param {Validation} given */
+function lagWords({ lag_s, lag_sigma_s }) {
+  if (lag_s === null) return "–";
+  return `${lag_s > 0 ? "+" : ""}${fixed(lag_s, 3)}${lag_sigma_s ? ` ± ${fixed(lag_sigma_s, 3)}` : ""} s`;
+}
+
+/** @param {number | null} lag_s */
+function lagSentence(lag_s) {
+  if (lag_s === null) return "The clock lag could not be told.";
+  const direction = lag_s > 0 ? "behind" : "ahead of";
+  return `The GPS clock runs ${direction} the video by ${fixed(Math.abs(lag_s), 3)} s, found from the motion itself.`;
+}
+
+function showTable() {
+  const rows = validation?.table ?? [];
+  fill(tableBox, h("header", {}, h("h2", {}, rows.length ? "Peaks and residual, video and GPS" : "Peaks and residual"), h("span", { class: "badge" }, target)), rows.length ? comparisonTable(rows) : summaryTable());
+}
+
+/** The paper's Table 2: a row per axis. @param {TableRow[]} rows */
+function comparisonTable(rows) {
+  const cells = (/** @type {Quantity} */ quantity, /** @type {"x" | "y"} */ of) => {
+    const row = rows.find((entry) => entry.quantity === quantity && entry.axis === of);
+    if (row === undefined) return [h("td", { class: "number group faint", colspan: 3 }, "–")];
+    const percent = row.error_percent === null || row.error_percent === undefined ? null : h("span", { class: "faint" }, ` (${fixed(row.error_percent, 1)} %)`);
+    return [h("td", { class: "number group" }, fixed(row.video_m * 100, 2)), h("td", { class: "number" }, fixed(row.gps_m * 100, 2)), h("td", { class: "number strong" }, fixed(row.error_m * 100, 2), percent)];
+  };
+  return h("table", { class: "table comparison" },
+    h("caption", { class: "visually-hidden" }, "Peak and residual displacement from video and GPS, centimetres"),
+    h("thead", {},
+      h("tr", {}, h("th", { rowspan: 2, scope: "col" }, "cm"), QUANTITIES.map(({ title }) => h("th", { colspan: 3, scope: "colgroup", class: "group centre" }, title))),
+      h("tr", {}, QUANTITIES.flatMap(() => ["Video", "GPS", "Error"].map((title, i) => h("th", { scope: "col", class: `number ${i === 0 ? "group" : ""}` }, title))))),
+    h("tbody", {}, AXES.map((entry) => h("tr", {}, h("th", { scope: "row" }, entry.name), QUANTITIES.flatMap(({ name }) => cells(name, entry.value))))));
+}
+
+/** Without GPS: what the video alone tells, P1 and P2. */
+function summaryTable() {
+  const summary = results.summary?.targets?.[target];
+  if (!summary) return h("p", { class: "soft" }, "The summary has no rows for this target.");
+  const peak = (/** @type {any} */ entry) => h("td", { class: "number" }, centimetres(entry?.value, 2), h("span", { class: "faint" }, entry ? ` at ${fixed(entry.time_s, 2)} s` : ""));
+  const rows = [["P1", summary], ["P2", summary.p2]].filter(([, of]) => of).flatMap(([name, of]) => AXES.map((entry) =>
+    h("tr", {}, h("th", { scope: "row" }, `${name}, ${entry.name}`), peak(of.peak_positive_m?.[entry.value]), peak(of.peak_negative_m?.[entry.value]), h("td", { class: "number" }, centimetres(of.residual_m?.[entry.value], 2)), h("td", { class: "number" }, millimetres(of.pre_event_rms_m?.[entry.value], 2)))));
+  const head = ["", "Peak, positive", "Peak, negative", "Residual", "Pre-event RMS"].map((title, i) => h("th", { scope: "col", class: i ? "number" : "" }, title));
+  return h("table", { class: "table comparison" }, h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows));
+}
+
+function showFiles() {
+  const files = results.files.filter(({ name }) => !NOT_FOR_PEOPLE.test(name)).sort((a, b) => rank(a) - rank(b));
+  const report = files.some(({ name }) => name === "report.html");
+  const make = h("button", { type: "button", class: "button small", onclick: makeReport }, icon("refresh", "small"), report ? "Remake" : "Make the report");
+  fill(fileBox, h("header", {}, h("h2", {}, "Files"), make), results.stale ? note("warn", "The project has changed since these files were made; update the results on the Track page.") : null, reportJob.element, h("ul", { class: "file-rows" }, files.map(fileRow)));
+}
+
+/** @param {ResultFile} file */
+function rank({ name }) {
+  if (name === `${target}.csv`) return -1;
+  const at = FILE_WORDS.findIndex(({ test }) => test.test(name));
+  return at < 0 ? FILE_WORDS.length : at;
+}
+
+/** @param {ResultFile} file */
+function fileRow(file) {
+  const url = `/api/${projectPath(page.id, `files/${encodeURIComponent(file.name)}`)}`;
+  const main = file.name === `${target}.csv`;
+  const words = FILE_WORDS.find(({ test }) => test.test(file.name))?.words ?? "";
+  const open = file.name.endsWith(".html") ? h("a", { class: "button quiet small icon-only", href: url, target: "_blank", rel: "noopener", "aria-label": `Open ${file.name}`, title: "Open" }, icon("expand", "small")) : null;
+  return h("li", {},
+    icon("file"),
+    h("span", { class: "file-words" }, h("span", { class: "file-name" }, file.name), h("span", { class: "small faint" }, words)),
+    h("span", { class: "number small faint" }, size(file.size)),
+    open,
+    h("a", { class: `button small icon-only ${main ? "primary" : "quiet"}`, href: url, download: file.name, "aria-label": `Download ${file.name}`, title: `Download ${file.name}`, "data-main": main }, icon("download", "small")));
+}
+
+function showArchive() {
+  const inputs = h("input", { type: "checkbox", checked: true });
+  const link = h("a", { class: "button", download: `${page.id}.zip` }, icon("archive"), "Download the project");
+  const point = () => (link.href = `/api/${projectPath(page.id, "archive", { inputs: inputs.checked ? 1 : 0 })}`);
+  inputs.addEventListener("change", point);
+  point();
+  fill(
+    archiveBox,
+    h("header", {}, h("h2", {}, "Whole project")),
+    h("p", { class: "small soft" }, "One archive with every decision and result. Restore it on any computer from the list of projects."),
+    h("label", { class: "check" }, inputs, "With video, cloud, lens and GPS"),
+    h("div", { class: "toolbar" }, link),
+  );
+}
+
+async function makeReport() {
+  try {
+    const { job } = await post(projectPath(page.id, "report"));
+    onJob(job);
+  } catch (error) {
+    toastError(error);
+  }
+}
+
+/** @param {import("../lib/types.js").Job} job */
+function onJob(job) {
+  if (job.kind !== "report") return;
+  reportJob.show(job);
+  if (isRunning(job)) return;
+  if (job.state === "done") toast("The report is ready.", { tone: "good" });
+  void reload().catch(toastError);
+}
+
+/** @param {string} wanted */
+function chooseAxis(wanted) {
+  axis = wanted === "y" ? "y" : "x";
+  axisChoice.set(axis);
+  setView({ axis: axis === "x" ? null : axis });
+  draw();
+}
+
+/** @param {string} wanted */
+function chooseTarget(wanted) {
+  target = wanted;
+  setView({ target: wanted });
+  void reload().catch(toastError);
+}

@@ -1,0 +1,275 @@
+// Track: measure every frame, and watch the history grow.
+
+import { get, post, projectPath, remove, sentence } from "../lib/api.js";
+import { fill, find, h } from "../lib/dom.js";
+import { count, duration, fixed, plural } from "../lib/format.js";
+import { icon } from "../lib/icons.js";
+import { setView, viewText } from "../lib/view-state.js";
+import { stepUrl } from "../components/header.js";
+import { AXES, fetchHistory, fetchResults, METHODS } from "../components/histories.js";
+import { isRunning } from "../components/job-card.js";
+import { note } from "../components/notes.js";
+import { openPage } from "../components/page.js";
+import { Plot } from "../components/plot.js";
+import { segmented } from "../components/segmented.js";
+import { announce, toastError } from "../components/toast.js";
+
+/** @typedef {import("../lib/types.js").Job} Job */
+/** @typedef {[frame: number, time_s: number, dx_m: number | null, dy_m: number | null, status: string]} Row */
+/** @typedef {{job: Job | null, resumable: boolean, frames_done: number, frames_total: number, message: string | null, preview: Record<string, Row[]>}} TrackState */
+
+const page = await openPage("track");
+const { store } = page;
+
+/** @type {TrackState} */
+let track = { job: null, resumable: false, frames_done: 0, frames_total: 0, message: null, preview: {} };
+/** Rows by target and frame: chunks may arrive in any order. @type {Map<string, Map<number, Row>>} */
+const rows = new Map();
+/** @type {import("../components/histories.js").Results | null} */
+let results = null;
+let target = viewText("target") ?? "";
+let duration_s = 0;
+let drawing = 0;
+
+const targetChoice = segmented({ label: "Target", choices: [], value: target, onChange: chooseTarget });
+const live = h("span", { class: "badge accent", hidden: true }, "Growing as frames arrive");
+const plotArea = h("div", { class: "plot-stack" });
+const controls = h("section", { class: "section", "aria-label": "Measurement" });
+const methods = h("section", { class: "section" }, h("header", {}, h("h2", {}, "Method")), h("div", { class: "choices", role: "radiogroup", "aria-label": "Method" }));
+const facts = h("section", { class: "section", "aria-label": "Result" });
+const empty = h("div", { class: "stage-empty", hidden: true });
+fill(
+  find("#main"),
+  h("div", { class: "stage" },
+    h("div", { class: "stage-bar" }, h("h1", {}, "Track"), targetChoice.element, h("span", { class: "spring" }), live),
+    h("div", { class: "stage-body padded" }, plotArea, empty)),
+  h("aside", { class: "side", "aria-label": "Run" }, controls, methods, facts),
+);
+const plots = AXES.map((axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "track", drag: "view" }));
+plots.forEach((plot, i) => plot.setTraces([{ label: "P1", colour: i === 0 ? "--series-1" : "--series-2" }], [[], []]));
+
+page.keys([
+  { keys: "R", group: "Track", label: "Start or resume", run: () => void start(false), when: () => !isRunning(track.job) && !blocked() },
+  { keys: "Shift+R", group: "Track", label: "Measure again from the first frame", run: () => void start(true), when: () => !isRunning(track.job) && !blocked() },
+  { keys: "C", group: "Track", label: "Cancel; what is measured is kept", run: () => void cancel(), when: () => isRunning(track.job) },
+]);
+store.on("change", show);
+page.events.on("hello", () => void catchUp());
+page.events.on("job", onJob);
+page.events.on("track", addRows);
+page.events.on("results", () => void loadResults());
+await catchUp();
+await loadDuration();
+
+/** Ask for the whole state: at first, and whenever the connection was lost. */
+async function catchUp() {
+  try {
+    track = await get(projectPath(page.id, "track"));
+    for (const [name, list] of Object.entries(track.preview ?? {})) for (const row of list) keep(name, row);
+    await loadResults();
+  } catch (error) {
+    toastError(error);
+  }
+  show();
+}
+
+async function loadDuration() {
+  const inputs = await get(projectPath(page.id, "inputs")).catch(() => null);
+  duration_s = inputs?.video?.duration_s ?? 0;
+  draw();
+}
+
+async function loadResults() {
+  results = await fetchResults(page.id).catch(() => null);
+  if (results?.ready && !isRunning(track.job)) await loadHistory();
+  show();
+}
+
+/** The finished history takes the place of what was drawn while it grew. */
+async function loadHistory() {
+  const name = currentTarget();
+  try {
+    const history = await fetchHistory(page.id, name);
+    rows.set(name, new Map(history.frame.map((frame, i) => [frame, [frame, history.time_s[i], history.p1_dx_m[i], history.p1_dy_m[i], history.status[i]]])));
+  } catch (error) {
+    toastError(error);
+  }
+  draw();
+}
+
+/** @param {Job} job */
+function onJob(job) {
+  if (job.kind !== "track") return;
+  const ended = isRunning(track.job) && !isRunning(job);
+  track = { ...track, job, frames_done: Math.max(job.done, track.frames_done), frames_total: job.total || track.frames_total };
+  if (ended) {
+    announce(job.state === "done" ? "The measurement is finished." : `The measurement stopped. ${job.message ?? ""}`);
+    void catchUp();
+  }
+  show();
+}
+
+/** @param {{target?: string, rows: Row[] | Record<string, Row[]>}} event */
+function addRows(event) {
+  const byTarget = Array.isArray(event.rows) ? { [event.target ?? currentTarget()]: event.rows } : event.rows;
+  for (const [name, list] of Object.entries(byTarget)) for (const row of list) keep(name, row);
+  if (drawing === 0) drawing = requestAnimationFrame(draw);
+}
+
+/** @param {string} name @param {Row} row */
+function keep(name, row) {
+  const known = rows.get(name) ?? new Map();
+  rows.set(name, known.set(row[0], row));
+}
+
+/** @param {boolean} fresh measure again from the first frame */
+async function start(fresh) {
+  try {
+    if (fresh || !track.resumable) rows.clear();
+    await store.settled();
+    const { job } = await post(projectPath(page.id, "track"), { fresh });
+    track = { ...track, job, message: null };
+  } catch (error) {
+    toastError(error);
+  }
+  show();
+}
+
+async function cancel() {
+  await remove(projectPath(page.id, "track")).catch(toastError);
+}
+
+/** @param {string} name */
+function chooseTarget(name) {
+  target = name;
+  setView({ target: name });
+  if (results?.ready && !isRunning(track.job)) void loadHistory();
+  draw();
+}
+
+function targetNames() {
+  return store.project.targets.map((entry) => entry.name);
+}
+
+function currentTarget() {
+  return targetNames().includes(target) ? target : (targetNames()[0] ?? "");
+}
+
+function blocked() {
+  return (store.state.problems ?? []).length > 0;
+}
+
+function show() {
+  targetChoice.element.hidden = targetNames().length < 2;
+  targetChoice.offer(targetNames().map((name) => ({ value: name, name })));
+  targetChoice.set(currentTarget());
+  live.hidden = !isRunning(track.job);
+  showControls();
+  showMethods();
+  showFacts();
+  draw();
+}
+
+function draw() {
+  drawing = 0;
+  const list = [...(rows.get(currentTarget()) ?? new Map()).values()].sort((a, b) => a[0] - b[0]);
+  const domain = /** @type {[number, number]} */ ([0, Math.max(duration_s, list.at(-1)?.[1] ?? 0) || 1]);
+  plots.forEach((plot, axis) => {
+    plot.domain = domain;
+    plot.statuses = list.map((row) => row[4] ?? "ok");
+    plot.setData([list.map((row) => row[1]), list.map((row) => row[2 + axis])]);
+  });
+  const nothing = list.length === 0 && !isRunning(track.job);
+  plotArea.classList.toggle("faint", nothing);
+  empty.hidden = !nothing;
+  if (nothing) fill(empty, h("p", {}, "The displacement history appears here while the video is measured."));
+}
+
+function showControls() {
+  const { job } = track;
+  if (isRunning(job)) return showRunning(/** @type {Job} */ (job));
+  const problems = store.state.problems ?? [];
+  const done = results?.ready && !results.stale && !track.resumable;
+  const notes = [
+    ...problems.map((problem) => note("bad", problem)),
+    job?.state === "failed" ? note("bad", job.message ?? "The measurement failed.") : null,
+    problems.length === 0 && track.resumable ? note("info", stoppedWords()) : null,
+    problems.length === 0 && results?.stale ? note("warn", store.state.steps.track.message || "The project has changed since these results were made.") : null,
+    done && job?.state !== "failed" ? note("good", doneWords()) : null,
+  ];
+  fill(controls, h("header", {}, h("h2", {}, "Measurement")), notes, buttons(Boolean(done)));
+}
+
+/** @param {boolean} done */
+function buttons(done) {
+  const off = blocked();
+  const first = track.resumable ? "Resume" : results?.stale ? "Update results" : "Start";
+  const go = h("button", { type: "button", class: `button ${done ? "" : "primary"}`, disabled: off, onclick: () => void start(done) }, icon(done ? "refresh" : "play"), done ? "Measure again" : first);
+  const again = h("button", { type: "button", class: "button quiet", disabled: off, onclick: () => void start(true) }, "Start from the first frame");
+  const onwards = h("a", { class: "button primary", href: stepUrl(page.id, "review") }, "Review the result", icon("arrow_right"));
+  return h("div", { class: "toolbar" }, done ? [onwards, go] : [go, track.resumable || results?.stale ? again : null]);
+}
+
+/** @param {Job} job */
+function showRunning(job) {
+  const share = job.total > 0 ? job.done / job.total : null;
+  const figure = (/** @type {string} */ value, /** @type {string} */ name) => h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
+  const bar = h("progress", { max: 1, "aria-label": "Progress", value: share });
+  fill(
+    controls,
+    h("header", {}, h("h2", {}, job.state === "queued" ? "Waiting for its turn" : job.stage ? job.stage[0].toUpperCase() + job.stage.slice(1) : "Starting"), h("span", { class: "number soft" }, share === null ? "" : `${fixed(100 * share, 0)} %`)),
+    bar,
+    h("div", { class: "figures" },
+      figure(job.total ? `${count(job.done)} / ${count(job.total)}` : "–", "frames"),
+      figure(job.rate_per_s ? fixed(job.rate_per_s, 1) : "–", "frames/s"),
+      figure(duration(job.seconds_left), "left")),
+    h("p", { class: "small faint" }, "You may close this tab: the measurement goes on, and every frame is kept."),
+    h("div", { class: "toolbar" }, h("button", { type: "button", class: "button", onclick: () => void cancel() }, icon("close"), "Cancel")),
+  );
+}
+
+function stoppedWords() {
+  return `${count(track.frames_done)} of ${plural(track.frames_total, "frame")} are measured and kept. Resuming goes on from there.`;
+}
+
+function doneWords() {
+  const { frames, seconds } = results?.summary ?? {};
+  const speed = frames && seconds ? ` in ${duration(seconds)}, ${fixed(frames / seconds, 1)} frames/s` : "";
+  return `Measured ${plural(frames ?? track.frames_total, "frame")}${speed}.`;
+}
+
+function showMethods() {
+  const box = find(".choices", HTMLElement, methods);
+  const focused = box.contains(document.activeElement);
+  fill(box, METHODS.map((method) => {
+    const on = store.project.method === method.value;
+    const input = h("input", { type: "radio", name: "method", value: method.value, checked: on, disabled: isRunning(track.job), onchange: () => chooseMethod(method.value) });
+    return h("label", { class: `choice ${on ? "on" : ""}` }, input, h("span", {}, h("strong", {}, method.name), h("span", { class: "small soft" }, method.line)));
+  }));
+  if (focused) /** @type {HTMLElement | null} */ (box.querySelector("input:checked"))?.focus();
+}
+
+/** @param {"geometric" | "paper"} method */
+function chooseMethod(method) {
+  const name = METHODS.find((entry) => entry.value === method)?.name ?? method;
+  void store.edit(`Method: ${name}`, (draft) => {
+    draft.method = method;
+    draft.drift.filter = method === "paper" ? "high-pass" : "none";
+  }).then(() => loadResults()).catch((error) => announce(sentence(error)));
+}
+
+function showFacts() {
+  const counts = results?.summary?.targets?.[currentTarget()]?.counts;
+  facts.hidden = !results?.ready || !counts;
+  if (facts.hidden) return;
+  const statusLine = (/** @type {string} */ status, /** @type {string} */ words) => [h("dt", {}, h("span", { class: `status-key ${status}` }), status), h("dd", {}, `${count(counts[status] ?? 0)} `, h("span", { class: "faint" }, words))];
+  fill(
+    facts,
+    h("header", {}, h("h2", {}, "Frames")),
+    h("dl", { class: "facts" },
+      statusLine("ok", "measured"),
+      statusLine("weak", "measured from few points"),
+      statusLine("lost", "could not be measured"),
+      statusLine("excluded", "rejected by you")),
+  );
+}
