@@ -88,7 +88,9 @@ class Lens:
     def valid_radius(self) -> float:
         """Largest ray radius up to which a larger angle still means a larger image radius; inf if there is no end."""
         k1, k2, _, _, k3 = self.distortion
-        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0]) if np.any([k1, k2, k3]) else np.empty(0)
+        slope = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])
+        # A coefficient this small bends nothing that a camera sees, but overflows the roots.
+        roots = np.roots(np.where(np.abs(slope) < 1e-12, 0.0, slope))
         turning = [root.real for root in roots if abs(root.imag) < 1e-12 and root.real > 0]
         return float(np.sqrt(min(turning))) if turning else float("inf")
 
