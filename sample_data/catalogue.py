@@ -8,18 +8,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sample_data import painting
-from sample_data.flight import Flight, Gust, Wandering
+from sample_data import happenings, painting
+from sample_data.flight import Flight, Wandering
+from sample_data.happenings import Fineness
 from sample_data.optics import TrueLens
 from sample_data.scene import Body, Light, Measured, Plate, Recording, Relief, RoofLines, Scene, Sensor, Survey
-from sample_data.shaking import Earthquake, Shaking, at_rest
-from sample_data.textures import Texture
+from sample_data.shaking import Earthquake, Shaking
 
 Floats = NDArray[np.float64]
 Rng = np.random.Generator
-
-PIXEL_BLUR_PX = 0.55
-"""What lens and pixel together smear a point to: one standard deviation, pixels."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +30,10 @@ class Brief:
         off_nadir_deg: how far the camera looks away from straight down.
         pre_event_s, event_s, post_event_s: lengths of the clip's parts.
         starts_s: how far into the motion the clip starts: everything before is cut off.
-        peak_m, residual_m, natural_hz, damping, rotation_rad: of the roof.
+        peak_m, residual_m, natural_hz, damping, ringing_s, rotation_rad: of the roof.
         drift_m, drift_band_hz: of the hovering camera.
         turn_deg: slow turning of the camera, and its gimbal's quick wobble.
+        margin_m: ground painted beyond what the undisturbed view shows.
         texture: contrast of the ground, 1 for ordinary ground.
         noise: read noise (grey levels) and shot noise (variance per grey level).
         extras: what else stands, passes or changes.
@@ -54,10 +52,12 @@ class Brief:
     residual_m: tuple[float, float] = (0.0, 0.0)
     natural_hz: float = 1.1
     damping: float = 0.06
+    ringing_s: float = 2.0
     rotation_rad: float = 2e-3
     drift_m: float = 0.2
     drift_band_hz: tuple[float, float] = (0.03, 0.45)
     turn_deg: tuple[float, float] = (0.35, 0.02)
+    margin_m: float = 2.5
     texture: float = 1.0
     noise: tuple[float, float] = (1.2, 0.022)
     roof_size_m: tuple[float, float] = (10.6, 7.4)
@@ -103,7 +103,6 @@ def build(
 def compose(name: str, brief: Brief, seed: int) -> Scene:
     """Return the scene a brief describes; everything random follows from the seed."""
     rng = np.random.default_rng([seed, 1])
-    ground_pixel = brief.altitude_m / brief.focal_px
     shaking = _shaking(brief, rng)
     flight = _flight(brief, rng)
     roof, lines = _roof(brief, rng, shaking)
@@ -114,7 +113,7 @@ def compose(name: str, brief: Brief, seed: int) -> Scene:
         lens=_lens(brief, rng),
         flight=flight,
         ground=painting.paint_ground(
-            rng, _ground_extent(brief, flight), texel_m=ground_pixel / 3, blur_m=PIXEL_BLUR_PX * ground_pixel, contrast=brief.texture
+            rng, _ground_extent(brief, flight), contrast=brief.texture, **Fineness.at(brief, 0.0).arguments
         ),
         relief=Relief.random(rng, 0.04, 1.1 * brief.altitude_m),
         plates=(roof, *_standing_objects(brief, rng)),
@@ -140,10 +139,13 @@ def _shaking(brief: Brief, rng: Rng) -> Shaking:
         table_peak_m=0.3 * brief.peak_m,
         natural_hz=brief.natural_hz,
         damping=brief.damping,
+        ringing_s=brief.ringing_s,
     )
     whole = Shaking.of(quake, brief.duration_s + brief.starts_s, rng)
     cut = brief.starts_s
-    return Shaking(lambda t: whole.table(np.asarray(t) + cut), lambda t: whole.roof(np.asarray(t) + cut)) if cut else whole
+    return (
+        Shaking(lambda t: whole.table(np.asarray(t) + cut), lambda t: whole.roof(np.asarray(t) + cut)) if cut else whole
+    )
 
 
 def _flight(brief: Brief, rng: Rng) -> Flight:
@@ -184,17 +186,21 @@ def _ground_extent(brief: Brief, flight: Flight) -> tuple[float, float, float, f
     x, y = flight.centre_m[:2]
     near, far = np.tan(tilt - np.arctan(half[1])), np.tan(tilt + np.arctan(half[1]))
     wide = half[0] / np.cos(tilt) / (1 - np.tan(tilt) * half[1])
-    margin = 2.0 + 0.12 * brief.altitude_m * half[0]
+    margin = brief.margin_m
     east = brief.altitude_m * wide + margin
-    return float(x - east), float(y + brief.altitude_m * near - margin), float(x + east), float(y + brief.altitude_m * far + margin)
+    return (
+        float(x - east),
+        float(y + brief.altitude_m * near - margin),
+        float(x + east),
+        float(y + brief.altitude_m * far + margin),
+    )
 
 
 def _roof(brief: Brief, rng: Rng, shaking: Shaking) -> tuple[Plate, RoofLines]:
-    pixel = (brief.altitude_m - brief.roof_m) / brief.focal_px
     wide, deep = brief.roof_size_m
     x, y = rng.uniform(-0.5, 0.5), rng.uniform(-0.25, 0.25)
     lines = RoofLines(y + 0.61, y - 0.61, x, (-0.36 * wide, 0.36 * wide), (-0.4 * deep, 0.4 * deep))
-    texture = painting.paint_roof(rng, brief.roof_size_m, lines, texel_m=pixel / 4, blur_m=PIXEL_BLUR_PX * pixel)
+    texture = painting.paint_roof(rng, brief.roof_size_m, lines, **Fineness.at(brief, brief.roof_m, 5.0).arguments)
     centre = tuple(rng.uniform(-0.6, 0.6, 2))
     return Plate("roof", brief.roof_m, texture, centre, rng.uniform(-0.02, 0.02), shaking.roof), lines
 
@@ -209,7 +215,7 @@ def _body(brief: Brief, rng: Rng, roof: Plate, shaking: Shaking) -> Body:
 def _standing_objects(brief: Brief, rng: Rng) -> list[Plate]:
     """Return parked cars, containers and crates around the building: they stand still but are no flat ground."""
     pixel = brief.altitude_m / brief.focal_px
-    fine = {"texel_m": pixel / 3, "blur_m": PIXEL_BLUR_PX * pixel}
+    fine = Fineness.at(brief, 1.5).arguments
     reach = 0.42 * np.array(brief.size_px) * pixel
     plates = []
     for number in range(9):
@@ -221,7 +227,8 @@ def _standing_objects(brief: Brief, rng: Rng) -> list[Plate]:
         if kind == 0:
             texture, height = painting.paint_car(rng, **fine), 1.45
         elif kind == 1:
-            texture = painting.paint_box(rng, (6.06, 2.44), rng.uniform(60, 180), painting.BLUE, **fine)
+            paint = (painting.BLUE, painting.RED, painting.CONCRETE)[rng.integers(0, 3)]
+            texture = painting.paint_box(rng, (6.06, 2.44), rng.uniform(60, 180), paint, **fine)
             height = 2.6
         else:
             texture = painting.paint_box(rng, (1.2, 1.0), rng.uniform(60, 220), painting.SOIL, **fine)
@@ -241,24 +248,91 @@ def _light(brief: Brief, rng: Rng) -> Light:
 
 def _intervals(brief: Brief) -> dict[str, tuple[float, float] | None]:
     start, end = brief.pre_event_s - brief.starts_s, brief.duration_s
-    settle = min(1.6, 0.35 * brief.post_event_s)
+    settle = min(brief.ringing_s, 0.4 * brief.post_event_s)
     tail = (round(end - brief.post_event_s + settle, 2), round(end - 0.1, 2))
     if start <= 0.5:
         return {"pre_event": tail, "event": (0.0, tail[0]), "residual": None}
     return {"pre_event": (0.0, round(start - 0.1, 2)), "event": (round(start, 2), tail[0]), "residual": tail}
 
 
+_SMALL = Brief(
+    size_px=(960, 540),
+    focal_share=0.99,
+    pre_event_s=3.0,
+    event_s=3.0,
+    post_event_s=2.0,
+    ringing_s=0.8,
+    recording=Recording(bit_rate=8_000_000),
+    survey=Survey(cloud_points=120_000, boards=0),
+)
+_EQ5 = Brief(peak_m=0.10, rotation_rad=8e-4)
+_EQ7 = Brief()
+_EQ9 = Brief(
+    altitude_m=62.0, peak_m=0.795, residual_m=(0.22, 0.015), natural_hz=0.8, rotation_rad=3e-3, post_event_s=6.0
+)
+_FULL_HD = Brief(size_px=(1920, 1080), recording=Recording(bit_rate=16_000_000))
+
+
+def _long_and_slow(brief: Brief) -> Brief:
+    """Return the scene with drift as slow as the paper's filter needs it, and long enough to see that."""
+    return replace(brief, pre_event_s=14.0, event_s=14.0, post_event_s=8.0, drift_band_hz=(0.02, 0.12))
+
+
 SCENES: dict[str, Brief] = {
-    "eq5": Brief(peak_m=0.10, rotation_rad=8e-4),
-    "eq7": Brief(),
-    "eq9": Brief(altitude_m=62.0, peak_m=0.795, residual_m=(0.22, 0.015), natural_hz=0.8, rotation_rad=3e-3, post_event_s=6.0),
-    "small": Brief(
-        size_px=(960, 540),
-        focal_share=0.99,
-        pre_event_s=3.0,
-        event_s=3.0,
-        post_event_s=2.0,
-        recording=Recording(bit_rate=8_000_000),
-        survey=Survey(cloud_points=120_000, boards=0),
+    "eq5": _EQ5,
+    "eq7": _EQ7,
+    "eq9": _EQ9,
+    "eq5_slow_drift": _long_and_slow(_EQ5),
+    "eq7_slow_drift": _long_and_slow(_EQ7),
+    "windy": replace(_EQ7, drift_m=0.6, turn_deg=(0.8, 0.04), margin_m=5.0),
+    "tall_flexible": Brief(
+        altitude_m=55.0,
+        roof_m=30.0,
+        natural_hz=0.18,
+        damping=0.04,
+        ringing_s=float("inf"),
+        event_s=9.0,
+        post_event_s=6.0,
+    ),
+    "poor_texture": Brief(texture=0.25, noise=(5.0, 0.0), recording=Recording(bit_rate=16_000_000)),
+    "fullhd": _FULL_HD,
+    "oblique": Brief(off_nadir_deg=25.0, sensor=Sensor(samples=(1, 3))),
+    "crossings": Brief(extras=(happenings.crossing_person_and_car, happenings.bird_over_line)),
+    "dust": Brief(extras=(happenings.dust,)),
+    "cloud_shadow": Brief(extras=(happenings.cloud_shadow,)),
+    "flicker": Brief(extras=(happenings.flicker,)),
+    "hidden_line": Brief(extras=(happenings.hidden_line,)),
+    "gust": Brief(extras=(happenings.gust,), margin_m=9.0),
+    "mid_shaking": Brief(pre_event_s=2.0, starts_s=4.5, post_event_s=9.0, ringing_s=3.0),
+    "fps60": replace(_FULL_HD, recording=Recording(rate_hz=60.0, bit_rate=25_000_000)),
+    "fps120": replace(
+        _FULL_HD,
+        pre_event_s=6.0,
+        event_s=5.0,
+        post_event_s=3.0,
+        sensor=Sensor(exposure_s=1 / 500),
+        recording=Recording(rate_hz=120.0, bit_rate=40_000_000),
+    ),
+    "variable_rate": replace(_FULL_HD, recording=Recording(bit_rate=16_000_000, uneven_time=0.2)),
+    "h265": replace(_FULL_HD, recording=Recording(bit_rate=10_000_000, codec="libx265")),
+    "portrait": Brief(size_px=(2160, 3840), roof_size_m=(9.6, 7.4), recording=Recording(turned=True)),
+    "points_roof": Brief(extras=(happenings.gravel_roof,)),
+    "two_targets": Brief(roof_size_m=(7.2, 5.4), extras=(happenings.measured_table,)),
+    "rolling_shutter": Brief(sensor=Sensor(readout_s=0.02), turn_deg=(0.35, 0.05)),
+    "national_grid": replace(_FULL_HD, survey=Survey(cloud_origin_m=(487231.0, 3639450.0, 127.3))),
+    "small": _SMALL,
+    "sample": replace(
+        _SMALL,
+        size_px=(1280, 720),
+        focal_share=0.75,
+        peak_m=0.36,
+        residual_m=(0.085, -0.02),
+        pre_event_s=7.0,
+        event_s=8.0,
+        post_event_s=5.0,
+        ringing_s=2.0,
+        recording=Recording(bit_rate=2_950_000, options={"preset": "slow", "g": "60"}),
+        survey=Survey(cloud_points=110_000, boards=12),
     ),
 }
+"""Name and brief of each scene."""

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sample_data.scene import Body, Plate, Scene
-from sample_data.textures import CHROMA_STEP, Texture
+from sample_data.textures import CHROMA_STEP, Texture, blurred, sample
 
 Image = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -35,14 +36,13 @@ class Lattice:
 
     Attributes:
         step: pixels between nodes.
-        rays: (rows, columns, 2), at raw pixels (node - 1/2) * step - 1/2 + `offset`.
+        rays: (rows, columns, 2) of node n at raw pixel (n - 1/2) step - 1/2, plus the sample's offset.
         row_px: (rows,) raw v of the nodes.
     """
 
     step: int
     rays: Floats
     row_px: Floats
-    column_px: Floats
 
     @classmethod
     def of(cls, scene: Scene, offset_px: tuple[float, float]) -> Lattice:
@@ -51,10 +51,10 @@ class Lattice:
         # Distortion bends like k r / f per pixel, and linear interpolation errs by step² / 8 of that.
         bend = 6 * 0.15 / float(scene.lens.focal_px.mean())
         step = 8 if bend * 64 / 8 < _LATTICE_ERROR_PX * 2 else 4
-        columns = (np.arange(-1, width // step + 2) + 0.5) * step - 0.5
-        rows = (np.arange(-1, height // step + 2) + 0.5) * step - 0.5
+        columns = np.arange(-0.5, width // step + 2) * step - 0.5
+        rows = np.arange(-0.5, height // step + 2) * step - 0.5
         u, v = np.meshgrid(columns + offset_px[0], rows + offset_px[1])
-        return cls(step, scene.lens.rays_from_raw(np.stack((u, v), axis=-1)), rows, columns)
+        return cls(step, scene.lens.rays_from_raw(np.stack((u, v), axis=-1)), rows)
 
     def window(self, corners_px: Floats, size_px: tuple[int, int]) -> Window | None:
         """Return the nodes around a box of raw pixels, (n, 2) corners, or None if it is not in the image."""
@@ -78,13 +78,14 @@ def fill(nodes: NDArray[np.floating], cell_px: int) -> Image:
     nodes = nodes.astype(np.float32)
     rows, columns = nodes.shape[:2]
     full = cv2.resize(nodes, (columns * cell_px, rows * cell_px), interpolation=cv2.INTER_LINEAR)
-    return full[cell_px:-cell_px, cell_px:-cell_px]
+    return cast(Image, full[cell_px:-cell_px, cell_px:-cell_px])
 
 
 def pixels_of(window: Window, cell_px: int, limit: tuple[int, int]) -> tuple[slice, slice]:
     """Return the rows and columns of an image of (rows, columns) that a window of nodes fills, `cell_px` a node."""
     rows, columns = (
-        slice(part.start * cell_px, min((part.stop - 2) * cell_px, most)) for part, most in zip(window, limit, strict=True)
+        slice(part.start * cell_px, min((part.stop - 2) * cell_px, most))
+        for part, most in zip(window, limit, strict=True)
     )
     return rows, columns
 
@@ -108,6 +109,13 @@ class Camera:
         return height, width
 
     @cached_property
+    def _vignette(self) -> Image:
+        """(rows, columns) share of the light that arrives."""
+        rows, columns = self.shape
+        v, u = np.linspace(-1, 1, rows, dtype=np.float32), np.linspace(-1, 1, columns, dtype=np.float32)
+        return 1 - np.float32(self.scene.sensor.vignetting / 2) * np.add.outer(v * v, u * u)
+
+    @cached_property
     def _low_plates(self) -> list[Plate]:
         return sorted((p for p in self.scene.plates if p.height_m <= _LOW_M), key=lambda plate: plate.height_m)
 
@@ -122,7 +130,7 @@ class Camera:
             self._lay(plate, time_s, luma, chroma)
         if self.scene.body is not None:
             self._shade(self.scene.body, time_s, luma)
-            for quad, texture in _walls(self.scene.body, time_s):
+            for quad, texture in _walls_seen(self.scene.body, time_s, self.scene.flight.pose(time_s)[1][0]):
                 self._stand(quad, texture, time_s, luma, chroma)
         for plate in self._high_plates:
             self._lay(plate, time_s, luma, chroma)
@@ -130,7 +138,8 @@ class Camera:
             lattice = self._lattices[0]
             plan = self._plan(lattice, lattice.whole, time_s, 0.0)
             shade = fill(self.scene.light.cloud(time_s, plan)[..., None], lattice.step)
-            cv2.multiply(luma, shade[: self.shape[0], : self.shape[1]], dst=luma)
+            luma *= shade[: self.shape[0], : self.shape[1]]
+        luma *= self._vignette
         return luma, chroma
 
     # --- geometry -----------------------------------------------------------------------------------------------
@@ -188,20 +197,18 @@ class Camera:
         height, width = self.shape
         texture = self.scene.ground
         half = self.scene.sensor.exposure_s / 2
-        probes = self.scene.lens.rays_from_raw(np.array([[0, 0], [width, 0], [width, height], [0, height], [width / 2, height / 2]]))
+        corners = np.array([[0, 0], [width, 0], [width, height], [0, height], [width / 2, height / 2]])
+        probes = self.scene.lens.rays_from_raw(corners)
         motion = np.abs(self._image_motion(probes, time_s - half, time_s + half)).max()
-        luma: Image | None = None
-        chroma = np.empty((0, 0, 2), np.float32)
+        luma, chroma = np.zeros((height, width), np.float32), np.empty((0, 0, 2), np.float32)
         sampling = self._sampling(float(motion), time_s)
         for lattice, instant in sampling:
             texels = texture.texels(self._ground_plan(lattice, instant))
-            full = fill(texels, lattice.step)[:height, :width]
-            seen = cv2.remap(texture.luma, full, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-            luma = seen if luma is None else cv2.add(luma, seen, dst=luma)
+            luma += sample(texture.luma, fill(texels, lattice.step)[:height, :width], "mirror")
             if chroma.size == 0:
-                chroma = _colour(texture, texels, lattice.step)[: height // 2, : width // 2]
-        assert luma is not None
-        return (luma if len(sampling) == 1 else cv2.multiply(luma, 1 / len(sampling))), np.ascontiguousarray(chroma)
+                chroma = _colour(texture, texels, lattice.step)[: height // 2, : width // 2].copy()
+        luma /= len(sampling)
+        return luma, chroma
 
     def _image_motion(self, rays: Floats, start_s: float, end_s: float) -> Floats:
         """Return how far ground points seen along rays (n, 2) at the start move in the image until the end, pixels."""
@@ -231,7 +238,7 @@ class Camera:
             full = fill(texels, step)[: sums.shape[1], : sums.shape[2]]
             for k, layer in enumerate((plate.texture.luma, plate.texture.cover)):
                 assert layer is not None, "a plate has an edge"
-                sums[k] += cv2.remap(layer, full, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+                sums[k] += sample(layer, full, "nothing")
         sums *= opacity / len(sampling)
         luma[rows, columns] = luma[rows, columns] * (1 - sums[1]) + sums[0]
         self._colour_over(chroma, window, _colour(plate.texture, texels, step), sums[1])
@@ -266,8 +273,10 @@ class Camera:
         full = fill(texels, lattice.step)
         area = pixels_of(window, lattice.step, self.shape)
         full = full[: area[0].stop - area[0].start, : area[1].stop - area[1].start]
-        cover = np.clip(np.minimum(full + 0.5, np.float32([columns - 0.5, rows - 0.5]) - full).min(axis=-1) + 0.5, 0, 1)
-        seen = cv2.remap(texture.luma, full, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        u, v = cv2.split(full)
+        inside = np.minimum(np.minimum(u + 1, columns - u), np.minimum(v + 1, rows - v))
+        cover = np.clip(inside, 0, 1).astype(np.float32)
+        seen = sample(texture.luma, full, "edge")
         luma[area] = luma[area] * (1 - cover) + seen * cover
         self._colour_over(chroma, window, _colour(texture, texels, lattice.step), cover)
 
@@ -294,29 +303,32 @@ class Camera:
         mask = np.zeros((rows, columns), np.uint8)
         corner_texels = np.round(((outline - low) / texel - 0.5) * 256).astype(np.int32)
         cv2.fillConvexPoly(mask, corner_texels, 255, cv2.LINE_AA, 8)
-        dark = cv2.GaussianBlur(mask.astype(np.float32) / 255, (0, 0), 1.5)
+        dark = blurred(mask.astype(np.float32) / np.float32(255), 1.5)
         plan = self._plan(lattice, window, time_s, 0.0)
         area = pixels_of(window, lattice.step, self.shape)
         texels = fill((plan - low) / texel - 0.5, lattice.step)
         texels = texels[: area[0].stop - area[0].start, : area[1].stop - area[1].start]
-        share = cv2.remap(dark, texels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        share = sample(dark, texels, "nothing")
         luma[area] *= 1 - (1 - self.scene.light.shadow_share) * share
 
 
 def _colour(texture: Texture, texels: Image, step: int) -> Image:
     """Return chroma offsets (rows / 2, columns / 2, 2) at the half-size pixels between nodes."""
     at = (fill(texels, step // 2) + 0.5) / CHROMA_STEP - 0.5
-    return cv2.remap(texture.chroma, at.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    return sample(texture.chroma, at.astype(np.float32, copy=False), "mirror")
 
 
-def _walls(body: Body, time_s: float) -> list[tuple[Floats, Texture]]:
-    """Return the four walls' corners and textures; those turned away are hidden by the roof drawn over them."""
+def _walls_seen(body: Body, time_s: float, centre_m: Floats) -> list[tuple[Floats, Texture]]:
+    """Return corners (4, 3) and texture of each wall that faces the camera."""
     foot, top = body.corners(time_s, top=False), body.corners(time_s, top=True)
-    quads = []
+    seen = []
     for side in range(4):
         left, right = side, (side + 1) % 4
-        quads.append((np.array([foot[left], foot[right], top[right], top[left]]), body.walls[side]))
-    return quads
+        along = foot[right] - foot[left]
+        outward = np.array([along[1], -along[0]])
+        if outward @ (centre_m - foot[left])[:2] > 0:
+            seen.append((np.array([foot[left], foot[right], top[right], top[left]]), body.walls[side]))
+    return seen
 
 
 def shadow_outline(body: Body, shadow_m_per_m: tuple[float, float], time_s: float) -> Floats:

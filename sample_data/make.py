@@ -17,7 +17,7 @@ from sample_data.survey import write_survey
 
 
 def make(scene: Scene, folder: Path, watch: Watcher = lambda done, total: None) -> None:
-    """Render a scene into a project folder, made if need be."""
+    """Render a scene into a project folder, made if need be; the video comes last."""
     folder.mkdir(parents=True, exist_ok=True)
     write_survey(scene, folder)
     write_video(scene, folder / "video.mp4", watch)

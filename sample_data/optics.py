@@ -1,6 +1,6 @@
 """The true lens of a rendered scene.
 
-Written apart from `core.lens` on purpose: an error in the engine's lens model must not cancel against the same error here.
+Written apart from `core.lens` on purpose: an error in the engine's lens model must not cancel against the same one.
 """
 
 from __future__ import annotations

@@ -69,9 +69,10 @@ def _slabs(canvas: Canvas, rng: Rng, base: float, contrast: float) -> None:
 
 def _fields(canvas: Canvas, rng: Rng, base: float, contrast: float) -> None:
     """Paint larger areas of other ground: asphalt, soil, grass."""
-    middle = np.array([canvas.west_m, canvas.north_m]) + np.array([1, -1]) * canvas.texel_m * np.array(
-        canvas.luma.shape[::-1]
-    ) / 2
+    middle = (
+        np.array([canvas.west_m, canvas.north_m])
+        + np.array([1, -1]) * canvas.texel_m * np.array(canvas.luma.shape[::-1]) / 2
+    )
     reach = canvas.texel_m * max(canvas.luma.shape) / 2
     for colour, tone in ((ASPHALT, -0.42), (SOIL, -0.1), (GRASS, -0.3)):
         way = rng.uniform(0, 2 * np.pi)
@@ -101,7 +102,11 @@ def _marks(canvas: Canvas, rng: Rng, base: float, contrast: float) -> None:
             foot = corner + 2.6 * bay * along
             canvas.line([foot, foot + 5 * side], 0.1, white * rng.uniform(0.85, 1))
     for _ in range(26):
-        at, turn, arm = np.array([west, north]) + rng.uniform(0, 1, 2) * size, rng.uniform(0, np.pi), rng.uniform(0.1, 0.4)
+        at, turn, arm = (
+            np.array([west, north]) + rng.uniform(0, 1, 2) * size,
+            rng.uniform(0, np.pi),
+            rng.uniform(0.1, 0.4),
+        )
         way = arm * np.array([np.cos(turn), np.sin(turn)])
         grey = white if rng.random() < 0.6 else base * (1 - 0.6 * contrast)
         canvas.line([at - way, at + way], arm * 0.25, grey)
@@ -116,8 +121,12 @@ def _marks(canvas: Canvas, rng: Rng, base: float, contrast: float) -> None:
 def blob(rng: Rng, centre_m: Floats, radius_m: float, corners: int = 18) -> Floats:
     """Return the (corners, 2) outline of a random rounded shape."""
     angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)
-    radius = radius_m * (1 + sum(rng.normal(0, 0.22 / k) * np.cos(k * angle + rng.uniform(0, 6.3)) for k in (1, 2, 3, 5)))
-    return np.asarray(centre_m + np.column_stack((radius * np.cos(angle), radius * rng.uniform(0.6, 1) * np.sin(angle))))
+    radius = radius_m * (
+        1 + sum(rng.normal(0, 0.22 / k) * np.cos(k * angle + rng.uniform(0, 6.3)) for k in (1, 2, 3, 5))
+    )
+    return np.asarray(
+        centre_m + np.column_stack((radius * np.cos(angle), radius * rng.uniform(0.6, 1) * np.sin(angle)))
+    )
 
 
 def _wander(rng: Rng, start_m: Floats, *, steps: int, step_m: float) -> Floats:
@@ -203,11 +212,20 @@ def _strip_across(canvas: Canvas, x_m: float, width_m: float, y_m: tuple[float, 
 
 def _furniture(canvas: Canvas, rng: Rng, look: RoofLook, lines: RoofLines, half_x: float, half_y: float) -> None:
     """Put hatches, vents and cables on the roof; cables cross the lines, hatches leave most of them free."""
-    for x, y, wide, deep in ((-0.72, 0.7, 0.9, 0.9), (0.7, -0.72, 1.2, 0.8), (0.78, 0.76, 0.5, 0.5), (-0.8, -0.66, 0.4, 0.6)):
+    for x, y, wide, deep in (
+        (-0.72, 0.7, 0.9, 0.9),
+        (0.7, -0.72, 1.2, 0.8),
+        (0.78, 0.76, 0.5, 0.5),
+        (-0.8, -0.66, 0.4, 0.6),
+    ):
         at = np.array([x * half_x, y * half_y]) + rng.uniform(-0.2, 0.2, 2)
         grey = rng.uniform(50, 225)
         canvas.box((at[0] + 0.05, at[1] - deep * 0.55, at[0] + wide * 0.62, at[1] + deep * 0.4), look.sheet * 0.45)
-        canvas.box((at[0] - wide / 2, at[1] - deep / 2, at[0] + wide / 2, at[1] + deep / 2), grey, BLUE if grey < 90 else CONCRETE)
+        canvas.box(
+            (at[0] - wide / 2, at[1] - deep / 2, at[0] + wide / 2, at[1] + deep / 2),
+            grey,
+            BLUE if grey < 90 else CONCRETE,
+        )
     for _ in range(7):
         canvas.polygon(blob(rng, rng.uniform([-half_x, -half_y], [half_x, half_y]), 0.09, 12), rng.uniform(40, 230))
     for start in ((-0.95, -0.3), (0.95, 0.45), (0.2, -0.98)):
@@ -225,7 +243,9 @@ def paint_gravel_roof(rng: Rng, size_m: tuple[float, float], *, texel_m: float, 
     canvas = Canvas((-half_x, -half_y, half_x, half_y), texel_m, base, (-4.0, 4.0))
     for _ in range(60):
         at = rng.uniform([-half_x, -half_y], [half_x, half_y])
-        canvas.polygon(blob(rng, at, rng.uniform(0.1, 0.7)), base * rng.uniform(0.7, 1.25), opacity=rng.uniform(0.3, 0.8))
+        canvas.polygon(
+            blob(rng, at, rng.uniform(0.1, 0.7)), base * rng.uniform(0.7, 1.25), opacity=rng.uniform(0.3, 0.8)
+        )
     for _ in range(2500):
         at = rng.uniform([-half_x, -half_y], [half_x, half_y])
         canvas.polygon(blob(rng, at, rng.uniform(0.015, 0.06), 7), base * rng.uniform(0.5, 1.5))
@@ -268,9 +288,7 @@ def paint_blob(rng: Rng, radius_m: float, grey: float, *, texel_m: float, blur_m
     return Texture(cover.luma * np.float32(grey), cover.luma, cover.chroma, cover.west_m, cover.north_m, texel_m)
 
 
-def paint_table(
-    rng: Rng, size_m: tuple[float, float], lines: RoofLines, *, texel_m: float, blur_m: float
-) -> Texture:
+def paint_table(rng: Rng, size_m: tuple[float, float], lines: RoofLines, *, texel_m: float, blur_m: float) -> Texture:
     """Return the steel platen of a shake table with painted lines and rows of anchor holes."""
     half_x, half_y = size_m[0] / 2, size_m[1] / 2
     grey = rng.uniform(88, 112)

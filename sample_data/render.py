@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
+from typing import cast
 
 import av
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,10 +36,14 @@ class Noise:
     def add(self, luma: Image) -> Image:
         """Return the image with noise of variance read² + shot * grey level."""
         row, column = self._rng.integers(0, _NOISE_MARGIN_PX, 2)
-        sign = self._rng.choice([-1.0, 1.0])
+        forwards = bool(self._rng.integers(0, 2))
         field = self._field[row : row + luma.shape[0], column : column + luma.shape[1]]
-        sigma = cv2.sqrt(cv2.add(cv2.multiply(cv2.max(luma, 0.0), self._shot), self._read**2))
-        return cv2.add(luma, cv2.multiply(field, sigma, scale=sign))
+        sigma = np.maximum(luma, 0)
+        sigma *= np.float32(self._shot)
+        sigma += np.float32(self._read**2)
+        np.sqrt(sigma, out=sigma)
+        sigma *= field
+        return luma + sigma if forwards else luma - sigma
 
 
 def frames(scene: Scene) -> Iterator[Bytes]:
@@ -48,19 +52,22 @@ def frames(scene: Scene) -> Iterator[Bytes]:
     noise = Noise(scene, np.random.default_rng([scene.seed, 11]))
     for time_s in scene.frame_times():
         luma, chroma = camera.expose(float(time_s))
-        gain = float(scene.light.exposure(np.array([time_s]))[0])
-        noisy = noise.add(cv2.multiply(luma, gain))
-        yield planes(noisy, chroma * np.float32(gain))
+        gain = np.float32(scene.light.exposure(np.array([time_s]))[0])
+        luma *= gain
+        yield planes(noise.add(luma), chroma * gain)
 
 
 def planes(luma: Image, chroma: Image) -> Bytes:
     """Return luma (rows, columns) and chroma offsets (rows / 2, columns / 2, 2) as one 4:2:0 image."""
     rows, columns = luma.shape
     frame = np.empty((rows * 3 // 2, columns), np.uint8)
-    frame[:rows] = cv2.add(luma, 0.0, dtype=cv2.CV_8U)
-    colours = cv2.add(chroma, (128.0, 128.0, 0.0, 0.0), dtype=cv2.CV_8U)
-    frame[rows:] = np.stack((colours[..., 0], colours[..., 1])).reshape(rows // 2, columns)
+    frame[:rows] = _bytes(luma)
+    frame[rows:] = _bytes(chroma + 128).transpose(2, 0, 1).reshape(rows // 2, columns)
     return frame
+
+
+def _bytes(values: Image) -> Bytes:
+    return np.clip(values + np.float32(0.5), 0, 255).astype(np.uint8)
 
 
 def write_video(scene: Scene, file: Path, watch: Watcher = lambda done, total: None, threads: int = 2) -> None:
@@ -70,14 +77,16 @@ def write_video(scene: Scene, file: Path, watch: Watcher = lambda done, total: N
     width, height = scene.lens.image_size_px
     stored = (height, width) if recording.turned else (width, height)
     with av.open(str(file), "w") as container:
-        stream = container.add_stream(recording.codec, rate=Fraction(recording.rate_hz).limit_denominator(1001))
+        rate = Fraction(recording.rate_hz).limit_denominator(1001)
+        stream = cast(
+            av.VideoStream, container.add_stream(recording.codec, rate=rate, options=_encoder_options(recording))
+        )
         stream.width, stream.height = stored
         stream.pix_fmt = "yuv420p"
         stream.bit_rate = recording.bit_rate
         stream.time_base = Fraction(1, TIME_BASE_HZ)
         stream.codec_context.time_base = Fraction(1, TIME_BASE_HZ)
         stream.codec_context.thread_count = threads
-        stream.options = _encoder_options(recording)
         for number, (time_s, image) in enumerate(zip(times, _ahead(frames(scene)), strict=True)):
             frame = av.VideoFrame.from_ndarray(_on_its_side(image) if recording.turned else image, format="yuv420p")
             frame.pts = round(time_s * TIME_BASE_HZ)
@@ -94,7 +103,7 @@ def _encoder_options(recording: Recording) -> dict[str, str]:
         # x265 numbers its threads by the machine; a fixed pool keeps the file the same everywhere.
         return {"preset": "ultrafast", "x265-params": "log-level=error:pools=2:frame-threads=1", **recording.options}
     rate = str(recording.bit_rate)
-    return {"preset": "veryfast", "maxrate": rate, "bufsize": rate, "g": "30", **recording.options}
+    return {"preset": "superfast", "maxrate": rate, "bufsize": rate, "g": "30", **recording.options}
 
 
 def _ahead(source: Iterator[Bytes]) -> Iterator[Bytes]:

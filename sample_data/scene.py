@@ -157,6 +157,7 @@ class Measured:
     plate: Plate
     lines: RoofLines
     kind: str = "lines"
+    name: str = "roof"
     relative_to: str | None = None
 
 
@@ -187,6 +188,7 @@ class Sensor:
         read_noise: grey levels, one standard deviation in the dark.
         shot_noise: variance in grey levels per grey level.
         samples: sub-pixel samples across and down.
+        vignetting: share of the light missing in the corners.
     """
 
     exposure_s: float = 1 / 240
@@ -194,6 +196,7 @@ class Sensor:
     read_noise: float = 1.2
     shot_noise: float = 0.022
     samples: tuple[int, int] = (1, 1)
+    vignetting: float = 0.12
 
 
 @dataclass(frozen=True)
@@ -245,7 +248,10 @@ class Survey:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything that decides a rendered project; with the seed it is the same on every machine."""
+    """Everything that decides a rendered project; with the seed it is the same on every machine.
+
+    `hidden_s` holds the times in which a measured line cannot be seen, so that nobody can measure it.
+    """
 
     name: str
     seed: int
@@ -261,6 +267,7 @@ class Scene:
     sensor: Sensor
     recording: Recording
     survey: Survey
+    hidden_s: tuple[tuple[float, float], ...] = ()
 
     def frame_times(self) -> Floats:
         """Return the (frames,) middle of each exposure, which is also its timestamp; the first is 0."""

@@ -14,7 +14,6 @@ Motion = Callable[[Floats], Floats]
 """(times,) -> (times, 3): displacement east and north in metres, rotation counter-clockwise in radians."""
 
 _STEP_S = 1 / 500
-_AT_REST = np.zeros(3)
 
 
 def at_rest(time_s: ArrayLike) -> Floats:
@@ -35,6 +34,7 @@ class Earthquake:
         table_peak_m: largest displacement of the table.
         natural_hz: first natural frequency of the building.
         damping: of that mode, as a part of critical.
+        ringing_s: how long it rings on after the strong shaking; infinite if it never quite stands still.
     """
 
     start_s: float
@@ -46,6 +46,7 @@ class Earthquake:
     table_peak_m: float = 0.1
     natural_hz: float = 1.1
     damping: float = 0.06
+    ringing_s: float = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +63,14 @@ class Shaking:
         table = np.stack([_ground_motion(time, quake, rng) for _ in range(2)], axis=-1)
         table *= quake.table_peak_m * np.array([1.0, quake.transverse]) / np.abs(table).max(axis=0)
         response = np.stack([_oscillator(table[:, axis], quake) for axis in range(2)], axis=-1)
-        fading = _after(time, quake.start_s, 0.3)
+        end = quake.start_s + quake.duration_s
+        silent = _after(time, end, quake.ringing_s) if np.isfinite(quake.ringing_s) else np.zeros_like(time)
+        response *= (1 - silent)[:, None]
         settled = _after(time, quake.start_s + 0.55 * quake.duration_s, 0.35 * quake.duration_s)[:, None]
         residual = settled * np.array(quake.residual_m)
         wanted = np.array([quake.peak_m, quake.transverse * quake.peak_m])
         roof = table + residual + response * _scale_to_peak(table + residual, response, wanted)
-        turn = _oscillator(_ground_motion(time, quake, rng), quake, detune=1.4) * fading
+        turn = _oscillator(_ground_motion(time, quake, rng), quake, detune=1.4) * (1 - silent)
         turn *= quake.rotation_rad / np.abs(turn).max()
         turn += 0.3 * quake.rotation_rad * settled[:, 0] * bool(np.any(quake.residual_m))
         return cls(

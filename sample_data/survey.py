@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import cv2
 import laspy
@@ -25,13 +26,14 @@ from core.project import (
 )
 from sample_data.exposure import Camera, shadow_outline
 from sample_data.scene import Body, Measured, Plate, RoofLines, Scene, place
-from sample_data.textures import look_up
+from sample_data.textures import blurred, look_up, sample
 
 Floats = NDArray[np.float64]
 
 _REFERENCE_FRAME = 0
 _BOARD_CORNERS = (9, 6)
 _BOARD_SQUARE_M = 0.025
+_BACKDROP = np.float32(95)
 _GPS_HZ = 10.0
 _GPS_BASELINE_M = (51.84, -3.27)
 """From the reference station to the antenna at rest."""
@@ -45,7 +47,7 @@ def write_survey(scene: Scene, folder: Path) -> None:
     write_gps(scene, folder / "gps.csv")
     write_checkerboards(scene, folder / "checkerboards")
     write_project(folder, finished_project(scene, camera))
-    write_truth(scene, camera, folder)
+    write_truth(scene, folder)
 
 
 # --- LiDAR ------------------------------------------------------------------------------------------------------
@@ -156,7 +158,7 @@ def write_checkerboards(scene: Scene, folder: Path) -> None:
         H = np.linalg.inv(np.column_stack((R[:, 0], R[:, 1], t)))
         on_board = cv2.perspectiveTransform(rays, H) / texel_m
         texels = (on_board + np.array(board.shape[::-1]) / 2 - 0.5).astype(np.float32)
-        seen = cv2.remap(board, texels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=95)
+        seen = _BACKDROP + sample(board - _BACKDROP, texels, "nothing")
         seen = seen * rng.uniform(0.8, 1.05) + rng.normal(0, 1.5, seen.shape)
         picture = np.clip(seen, 0, 255).astype(np.uint8)
         cv2.imwrite(str(folder / f"board_{number + 1:02d}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 85])
@@ -168,8 +170,8 @@ def _board_picture() -> tuple[NDArray[np.float32], float]:
     columns, rows = _BOARD_CORNERS[0] + 1, _BOARD_CORNERS[1] + 1
     squares = (np.add.outer(np.arange(rows), np.arange(columns)) % 2).astype(np.float32)
     board = np.kron(25 + 200 * squares, np.ones((per_square, per_square), np.float32))
-    board = cv2.copyMakeBorder(board, *4 * [per_square], cv2.BORDER_CONSTANT, value=225)
-    return cv2.GaussianBlur(board, (0, 0), 2.0), _BOARD_SQUARE_M / per_square
+    board = np.pad(board.astype(np.float32), per_square, constant_values=225)
+    return blurred(board, 2.0), _BOARD_SQUARE_M / per_square
 
 
 def _board_pose(scene: Scene, rng: np.random.Generator, number: int) -> tuple[Floats, Floats]:
@@ -258,7 +260,9 @@ def _clicks(
     """Return 20 well spread pairs on free ground, one in each of 20 fields of the frame where there is any."""
     width, height = scene.lens.image_size_px
     time_s = float(scene.frame_times()[_REFERENCE_FRAME])
-    fields = [(i, j) for j in range(4) for i in range(5)] if width > height else [(i, j) for j in range(5) for i in range(4)]
+    fields = (
+        [(i, j) for j in range(4) for i in range(5)] if width > height else [(i, j) for j in range(5) for i in range(4)]
+    )
     across, down = (5, 4) if width > height else (4, 5)
     pairs: list[Correspondence] = []
     for attempt in range(40 * len(fields)):
@@ -319,7 +323,7 @@ def _target(scene: Scene, measured: Measured, rng: np.random.Generator, origin: 
     if measured.kind == "points":
         region = tuple(_point(at + origin[:2], 2) for at in apparent_plan(scene, measured, _region(lines)))
         return Target(
-            name=measured.plate.name,
+            name=measured.name,
             kind="points",
             height_m=round(height, 3),
             region_m=region,
@@ -335,7 +339,7 @@ def _target(scene: Scene, measured: Measured, rng: np.random.Generator, origin: 
         plan = apparent_plan(scene, measured, np.array(ends)) + rng.normal(0, 0.02, (2, 2)) + origin[:2]
         bands[name] = Band(from_m=_point(plan[0], 3), to_m=_point(plan[1], 3), width_m=0.5)
     return Target(
-        name=measured.plate.name,
+        name=measured.name,
         height_m=round(height, 3),
         p1_p2_m=round(distance, 4),
         lines=Lines(**bands),
@@ -360,27 +364,35 @@ def apparent_plan(scene: Scene, measured: Measured, own_m: Floats) -> Floats:
 # --- truth ------------------------------------------------------------------------------------------------------
 
 
-def write_truth(scene: Scene, camera: Camera, folder: Path) -> None:
+def write_truth(scene: Scene, folder: Path) -> None:
     """Write `truth.csv` (the first target) and `truth.npz` (everything).
 
     Displacement is that of P1 and P2 from rest in world metres, and the rotation from rest, at the frame's timestamp:
-    the middle of the exposure of the image's middle row.
+    the middle of the exposure of the image's middle row. A target relative to another has the difference. `_motion` is
+    the plate's: displacement of its centre at rest (`_centre_m`) and rotation, from which any other point follows.
     """
     times = scene.frame_times()
     R, C = scene.flight.pose(times)
-    arrays: dict[str, NDArray] = {
+    arrays: dict[str, Any] = {
         "time_s": times,
         "R_camera_world": R,
         "centre_m": C,
         "camera_matrix": scene.lens.camera_matrix,
         "distortion": scene.lens.distortion,
         "cloud_origin_m": np.array(scene.survey.cloud_origin_m),
-        "targets": np.array([one.plate.name for one in scene.measured]),
+        "targets": np.array([one.name for one in scene.measured]),
+        "hidden": np.any([(times >= start) & (times <= end) for start, end in [*scene.hidden_s, (1, 0)]], axis=0),
     }
+    base = {one.name: one for one in scene.measured}
     for one in scene.measured:
-        name = one.plate.name
+        name = one.name
         moved, points, apparent = displacement(one, times, C)
+        if one.relative_to is not None:
+            base_moved, base_points, _ = displacement(base[one.relative_to], times, C)
+            moved, points = moved - base_moved, points - base_points
         arrays |= {
+            f"{name}_motion": moved,
+            f"{name}_centre_m": np.array(one.plate.centre_m),
             f"{name}_p1_m": points[:, 0],
             f"{name}_p2_m": points[:, 1],
             f"{name}_rotation_rad": moved[:, 2],
@@ -389,9 +401,15 @@ def write_truth(scene: Scene, camera: Camera, folder: Path) -> None:
             f"{name}_rest_m": place(one.lines.points_m, one.plate.centre_m, one.plate.heading_rad, np.zeros(3)),
         }
     np.savez_compressed(folder / "truth.npz", **arrays)
-    first = scene.measured[0].plate.name
+    first = scene.measured[0].name
     columns = np.column_stack(
-        (np.arange(len(times)), times, arrays[f"{first}_p1_m"], arrays[f"{first}_p2_m"], arrays[f"{first}_rotation_rad"])
+        (
+            np.arange(len(times)),
+            times,
+            arrays[f"{first}_p1_m"],
+            arrays[f"{first}_p2_m"],
+            arrays[f"{first}_rotation_rad"],
+        )
     )
     header = "frame,time_s,p1_dx_m,p1_dy_m,p2_dx_m,p2_dy_m,rotation_rad"
     np.savetxt(folder / "truth.csv", columns, "%d,%.6f,%.6f,%.6f,%.6f,%.6f,%.8f", header=header, comments="")

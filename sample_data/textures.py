@@ -1,8 +1,10 @@
-"""Pictures of flat things at a known place, finer than the camera sees them: painted, then blurred once to what a pixel sees."""
+"""Pictures of flat things at a known place: painted finer than the camera sees, blurred once to what a pixel sees."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from typing import Literal, cast
 
 import cv2
 import numpy as np
@@ -42,11 +44,7 @@ class Texture:
         """Return the (..., 2) texel coordinates (column, row; 0 is a texel's centre) of plan metres (..., 2)."""
         column = (plan_m[..., 0] - self.west_m) / self.texel_m - 0.5
         row = (self.north_m - plan_m[..., 1]) / self.texel_m - 0.5
-        return np.stack((column, row), axis=-1).astype(np.float32)
-
-    def without_cover(self) -> Image:
-        """Return (rows, columns) grey levels as they would be without an edge."""
-        return self.luma if self.cover is None else self.luma / np.maximum(self.cover, 1e-3)
+        return np.stack((column, row), axis=-1).astype(np.float32, copy=False)
 
 
 class Canvas:
@@ -91,7 +89,7 @@ class Canvas:
     def line(self, points_m: ArrayLike, width_m: float, grey: float, opacity: float = 1.0) -> None:
         """Paint a polyline (n, 2) as a ribbon: a crack, a cable, a joint that runs askew."""
         points = np.asarray(points_m, dtype=np.float64)
-        for start, end in zip(points[:-1], points[1:], strict=True):
+        for start, end in itertools.pairwise(points):
             along = end - start
             across = np.array([-along[1], along[0]]) * (width_m / 2 / max(float(np.hypot(*along)), 1e-9))
             self.polygon([start + across, end + across, end - across, start - across], grey, opacity=opacity)
@@ -104,26 +102,25 @@ class Canvas:
         coarse = rng.standard_normal(coarse_shape, dtype=np.float32)
         turn = np.array([[1 / step, 0, rng.uniform(0, 1)], [0, 1 / step, rng.uniform(0, 1)]])
         flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        fine = cv2.warpAffine(coarse, turn, (columns, rows), flags=flags, borderMode=cv2.BORDER_REFLECT)
-        cv2.multiply(self.luma, cv2.add(cv2.multiply(fine, contrast), 1.0), dst=self.luma)
+        fine = cast(Image, cv2.warpAffine(coarse, turn, (columns, rows), flags=flags, borderMode=cv2.BORDER_REFLECT))
         if colour:
-            small = cv2.resize(fine, self.chroma.shape[1::-1], interpolation=cv2.INTER_AREA)
+            small = cast(Image, cv2.resize(fine, self.chroma.shape[1::-1], interpolation=cv2.INTER_AREA))
             self.chroma += small[:, :, None] * np.array([-colour, colour], np.float32)
+        fine *= np.float32(contrast)
+        fine += 1
+        self.luma *= fine
 
     def finish(self, blur_m: float, *, has_edge: bool) -> Texture:
         """Return the texture as a pixel sees it: blurred by a Gaussian of one standard deviation `blur_m`."""
         sigma = blur_m / self.texel_m
-        luma, chroma, west, north = self.luma, self.chroma, self.west_m, self.north_m
-        cover = None
-        if has_edge:
-            border = -(-int(np.ceil(4 * sigma) + 1) // CHROMA_STEP) * CHROMA_STEP
-            cover = cv2.copyMakeBorder(np.ones_like(luma), *4 * [border], cv2.BORDER_CONSTANT, value=0)
-            luma = cv2.copyMakeBorder(luma, *4 * [border], cv2.BORDER_CONSTANT, value=0)
-            chroma = cv2.copyMakeBorder(chroma, *4 * [border // CHROMA_STEP], cv2.BORDER_REPLICATE)
-            west, north = west - border * self.texel_m, north + border * self.texel_m
-            cover = cv2.GaussianBlur(cover, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-        luma = cv2.GaussianBlur(luma, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
-        return Texture(luma, cover, chroma, west, north, self.texel_m)
+        if not has_edge:
+            return Texture(blurred(self.luma, sigma), None, self.chroma, self.west_m, self.north_m, self.texel_m)
+        border = -(-int(np.ceil(4 * sigma) + 1) // CHROMA_STEP) * CHROMA_STEP
+        cover = np.pad(np.ones_like(self.luma), border)
+        chroma = np.pad(self.chroma, ((border // CHROMA_STEP,) * 2, (border // CHROMA_STEP,) * 2, (0, 0)), mode="edge")
+        west, north = self.west_m - border * self.texel_m, self.north_m + border * self.texel_m
+        luma = blurred(np.pad(self.luma, border), sigma)
+        return Texture(luma, blurred(cover, sigma), chroma, west, north, self.texel_m)
 
     def _overlap(self, start_m: float, end_m: float, count: int) -> tuple[slice, Floats]:
         """Return the texels an interval touches and the share of each that it covers."""
@@ -141,11 +138,27 @@ class Canvas:
             part += weight * (np.array(colour, np.float32) - part)
 
 
+def blurred(image: Image, sigma: float) -> Image:
+    """Return the image after a Gaussian of one standard deviation `sigma`, texels; it goes on mirrored beyond."""
+    return cast(Image, cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT))
+
+
+Beyond = Literal["edge", "mirror", "nothing"]
+_BORDERS = {"edge": cv2.BORDER_REPLICATE, "mirror": cv2.BORDER_REFLECT_101, "nothing": cv2.BORDER_CONSTANT}
+
+
+def sample(image: Image, places: Image, beyond: Beyond) -> Image:
+    """Return the image's values between texels: (rows, columns[, channels]) at (column, row) places (rows, columns, 2).
+
+    `beyond` its edge one sees the nearest texel, the image mirrored, or zero.
+    """
+    # OpenCV's type stubs do not know that the second map may be left out.
+    one_map = cast(NDArray[np.float32], None)
+    return cast(Image, cv2.remap(image, places, one_map, cv2.INTER_LINEAR, borderMode=_BORDERS[beyond]))
+
+
 def look_up(image: Image, places: Image) -> Floats:
     """Return the image's values (n,) at scattered (column, row) places (n, 2); beyond its edge, the nearest one's."""
     most = 30_000  # OpenCV's remap takes no longer row
-    values = [
-        cv2.remap(image, places[None, i : i + most], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
-        for i in range(0, len(places), most)
-    ]
+    values = [sample(image, places[None, i : i + most], "edge")[0] for i in range(0, len(places), most)]
     return np.concatenate(values).astype(np.float64) if values else np.empty(0)
