@@ -192,6 +192,9 @@ class Jobs:
         self._closing = True
         active = [job for job in list(self._jobs.values()) if job.state in ACTIVE]
         for job in active:
+            process = self._processes.get(job.id)
+            if job.kind == _BESIDE and process is not None:
+                process.kill()  # it has nothing to lose
             self.cancel(job)
         for job in active:
             self._await_end(job, _PATIENCE_S)

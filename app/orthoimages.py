@@ -13,12 +13,14 @@ from app.sites import read_site
 from app.store import CACHE_FOLDER, ProjectFolder, read_json
 from core.coordinates import OrthoGrid
 from core.errors import InputError
-from core.measure import video_identity
 from core.orthoimage import make_orthoimage, read_geotiff, read_grid, write_geotiff
+from core.prediction import video_identity
 from core.progress import CancelToken, Progress
+from core.project import Orthoimage as Settings
 from core.project import Project, read_project, write_atomically
 
 ORTHOIMAGE_FILE = "orthoimage.tif"
+_MADE_FROM = "orthoimage.made-from"
 _NOTE = "orthoimage.json"
 
 
@@ -47,7 +49,7 @@ def state_of(folder: ProjectFolder, project: Project) -> OrthoState:
         return OrthoState(ready=False, stale=False, grid=None, note={})
     note = read_json(folder.results / CACHE_FOLDER / _NOTE)
     note = note if isinstance(note, dict) and note.get("made") == list(fingerprint(file)[1:]) else {}
-    return OrthoState(ready=True, stale=_is_stale(folder, project, grid, note), grid=grid, note=note)
+    return OrthoState(ready=True, stale=_is_stale(folder, project, grid), grid=grid, note=note)
 
 
 @lru_cache(maxsize=32)
@@ -55,17 +57,25 @@ def _grid(key: Fingerprint) -> OrthoGrid:
     return read_grid(key[0])
 
 
-def _is_stale(folder: ProjectFolder, project: Project, grid: OrthoGrid, note: dict[str, Any]) -> bool:
+def _is_stale(folder: ProjectFolder, project: Project, grid: OrthoGrid) -> bool:
     settings, extent = project.orthoimage, project.orthoimage.extent_m
     if abs(settings.pixel_size_m - grid.pixel_size_m) > 1e-9:
         return True
     if extent is not None and max(abs(a - b) for a, b in zip(extent, grid.extent_m, strict=True)) > grid.pixel_size_m:
         return True
-    if not note:  # made by the command line, which makes it anew whenever it runs
-        return False
     cloud = folder.input_path("cloud", project)
-    same_cloud = cloud is not None and cloud.is_file() and note["cloud"] == _identity(fingerprint(cloud))
-    return not same_cloud or note["settings"] != settings.model_dump(mode="json")
+    if cloud is None or not cloud.is_file():
+        return True
+    try:
+        made_from = (folder.results / _MADE_FROM).read_text(encoding="utf-8")
+    except OSError:
+        return True
+    return made_from != _origin(_identity(fingerprint(cloud)), settings)
+
+
+def _origin(cloud: str, settings: Settings) -> str:
+    """Return what an orthoimage is made from, as a run of the engine notes it down too."""
+    return f"{cloud} {settings.model_dump_json()}"
 
 
 @lru_cache(maxsize=32)
@@ -115,10 +125,10 @@ def build(folder: Path, order: dict[str, Any], progress: Progress, cancel: Cance
     cancel.raise_if_cancelled()
     file = folder / "results" / ORTHOIMAGE_FILE
     write_geotiff(file, ortho)
+    made_from = _origin(video_identity(Path(order["cloud"])), project.orthoimage)
+    write_atomically(file.with_name(_MADE_FROM), made_from.encode())
     note = {
         "made": list(fingerprint(file)[1:]),
-        "cloud": video_identity(Path(order["cloud"])),
-        "settings": project.orthoimage.model_dump(mode="json"),
         "measured_share": ortho.measured_share,
         "filled_share": ortho.filled_share,
         "spacing_m": ortho.spacing_m,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 from collections import OrderedDict
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from app.errors import NotYet
+from app.errors import ApiError, NotYet
 from app.frames import fingerprint
 from app.jobs import Jobs
 from app.store import CACHE_FOLDER, ProjectFolder, read_json
@@ -49,13 +50,10 @@ class Sites:
             InputError: the cloud was read and cannot be used.
         """
         key = site_key(path, project)
-        facts = read_json(folder.results / CACHE_FOLDER / _FACTS)
-        if isinstance(facts, dict) and facts.get("key") == key:
-            if "error" in facts:
-                raise InputError(facts["error"])
-            return {name: value for name, value in facts.items() if name not in ("key", "source", "plane")}
-        self._read(folder, project, path, key)
-        return None
+        facts = _known(folder, key)
+        if facts is None:
+            self._read(folder, project, path, key)
+        return facts
 
     def site(self, folder: ProjectFolder, project: Project) -> Site:
         """Return the cloud and the ground of a project.
@@ -67,7 +65,9 @@ class Sites:
         path = folder.require_input("cloud", project)
         if self.facts(folder, project, path) is None:
             raise NotYet("The cloud is being read; it takes a moment the first time.", path="inputs.cloud")
-        key = site_key(path, project)
+        return self._site(folder, site_key(path, project))
+
+    def _site(self, folder: ProjectFolder, key: str) -> Site:
         with self._lock:
             site = self._sites.pop(key, None) or _load(folder.results / CACHE_FOLDER, key)
             self._sites[key] = site
@@ -76,11 +76,21 @@ class Sites:
         return site
 
     def site_if_read(self, folder: ProjectFolder, project: Project) -> Site | None:
-        """Return the cloud and the ground where they are there at once; None where there are none, or not yet."""
+        """Return the cloud and the ground where they have been read before; None where not. Starts nothing."""
         try:
-            return self.site(folder, project) if project.inputs.cloud else None
-        except Exception:  # whatever keeps the cloud away, what is asked for here can do without it
+            path = folder.input_path("cloud", project)
+            if path is None or _known(folder, site_key(path, project)) is None:
+                return None
+            return self._site(folder, site_key(path, project))
+        except (InputError, ApiError):
             return None
+
+    def begin(self, folder: ProjectFolder, project: Project) -> None:
+        """Have the cloud read if there is one and it has not been."""
+        with contextlib.suppress(InputError, ApiError):
+            path = folder.input_path("cloud", project)
+            if path is not None:
+                self.facts(folder, project, path)
 
     def _read(self, folder: ProjectFolder, project: Project, path: Path, key: str) -> None:
         if self._jobs.running(folder.id, "cloud") is None:
@@ -91,6 +101,15 @@ class Sites:
 def site_key(path: Path, project: Project) -> str:
     """Return what changes whenever the cloud's file or the height of the ground does."""
     return json.dumps([*fingerprint(path), project.orthoimage.ground_z_m])
+
+
+def _known(folder: ProjectFolder, key: str) -> dict[str, Any] | None:
+    facts = read_json(folder.results / CACHE_FOLDER / _FACTS)
+    if not isinstance(facts, dict) or facts.get("key") != key:
+        return None
+    if "error" in facts:
+        raise InputError(facts["error"])
+    return {name: value for name, value in facts.items() if name not in ("key", "source", "plane")}
 
 
 def read_site(folder: Path, order: dict[str, Any], progress: Progress, cancel: CancelToken) -> Site:

@@ -76,8 +76,8 @@ class ProjectFolder:
             InputError: `project.json` cannot be used.
         """
         with self._lock:
-            text, project = self._read()
-            return Saved(project, self._history.follow(text))
+            project = self._read()
+            return Saved(project, self._history.follow(project_json(project)))
 
     def save(self, document: Any, *, revision: int, label: str, merge: bool = False) -> Saved:
         """Replace the project, if `revision` is still the newest.
@@ -171,7 +171,7 @@ class ProjectFolder:
         for part in self.folder.glob(f"{_PART_PREFIX}*"):
             part.unlink(missing_ok=True)
 
-    def _read(self) -> tuple[str, Project]:
+    def _read(self) -> Project:
         file = self.folder / PROJECT_FILE
         try:
             text = file.read_text(encoding="utf-8")
@@ -179,7 +179,7 @@ class ProjectFolder:
             raise Missing(f"{self.id}: there is no such project.", path=self.id) from None
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{file}: cannot be read ({error}); restore it from a copy.") from None
-        return text, parse_project(text, file)
+        return parse_project(text, file)
 
     def _require_newest(self, revision: int) -> None:
         saved = self.load()
@@ -195,7 +195,7 @@ class ProjectFolder:
         if problems:
             raise Invalid("; ".join(problems) + ".", path=problems[0].partition(":")[0], problems=problems)
         project = Project.model_validate(document)
-        before = stored_inputs(self._read()[1].inputs)
+        before = stored_inputs(self._read().inputs)
         changed = {kind: file for kind, file in stored_inputs(project.inputs).items() if file != before[kind]}
         relative = {kind: self._relative(self.folder / file) for kind, file in changed.items() if file is not None}
         return project.model_copy(update={"inputs": with_inputs(project.inputs, relative)})

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from app import orthoimages, sites
+from app import calibrations, orthoimages, sites
 from app.worker import Reporter
 from core.progress import CancelToken
 
@@ -25,7 +25,12 @@ def _orthoimage(folder: Path, order: dict[str, Any], report: Reporter, cancel: C
     return result
 
 
+def _calibrate(folder: Path, order: dict[str, Any], report: Reporter, cancel: CancelToken) -> Any:
+    return calibrations.calibrate_lens(folder, order, report, cancel)
+
+
 WORK: dict[str, Work] = {
+    "calibrate": _calibrate,
     "cloud": _cloud,
     "orthoimage": _orthoimage,
 }

@@ -47,6 +47,7 @@ def fit(folder: Folder, here: Here, wanted: Pairs | None = None) -> dict[str, An
     pairs = project.correspondences
     if wanted is not None and wanted.correspondences is not None:
         pairs = wanted.correspondences
+    here.sites.begin(folder, project)
     coverage = _coverage(here, folder, project, pairs)
     try:
         found = reference_fit(here, folder, project, pairs)

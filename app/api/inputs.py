@@ -11,6 +11,7 @@ from fastapi.responses import FileResponse
 from starlette.concurrency import run_in_threadpool
 
 from app.api.projects import Body
+from app.calibrations import REPORT_FILE, board_of
 from app.context import Context, Folder, Here, tell_saved
 from app.errors import ApiError, Invalid, Missing
 from app.jobs import Finish
@@ -212,6 +213,7 @@ def calibrate(wanted: Calibration, folder: Folder, here: Here) -> dict[str, Any]
         files = [here.places.file(file) for file in wanted.files]
     if not files:
         raise Invalid("There are no checkerboard pictures yet; send some, or choose files.", path="files")
+    board_of(wanted.board)
     parameters = {"files": [str(file) for file in files], "board": wanted.board, "square_m": wanted.square_m}
     job = here.jobs.start(folder, "calibrate", parameters, finish_calibration(here))
     return {"job": job.as_json()}
@@ -233,7 +235,7 @@ def finish_calibration(here: Context) -> Finish:
 @router.get("/projects/{project_id}/lens/report")
 def lens_report(folder: Folder) -> dict[str, Any]:
     """Return the report of the last calibration."""
-    report = read_json(folder.results / "lens_report.json")
+    report = read_json(folder.results / REPORT_FILE)
     if not isinstance(report, dict):
         raise Missing("No lens has been calibrated in this project; send checkerboard pictures first.")
     return report

@@ -32,6 +32,7 @@ Pixels = Annotated[int, Query(ge=10_000, le=60_000_000)]
 def orthoimage(folder: Folder, here: Here) -> dict[str, Any]:
     """Return the raster of the orthoimage and whether it still fits the project."""
     project = folder.load().project
+    here.sites.begin(folder, project)
     state = orthoimages.state_of(folder, project)
     site = here.sites.site_if_read(folder, project)
     running = here.jobs.running(folder.id, "orthoimage")

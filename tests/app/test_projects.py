@@ -1,0 +1,190 @@
+"""Projects: edits that cannot be lost, states that can be gone back to, copies and the trash."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app.server import create_app
+from tests.app.conftest import ADDRESS, WRITE
+
+SMALL = "/api/projects/small"
+
+
+def get(client: TestClient) -> dict[str, Any]:
+    found: dict[str, Any] = client.get(SMALL).json()
+    return found
+
+
+def rename(client: TestClient, name: str, revision: int, **more: Any) -> Any:
+    project = get(client)["project"] | {"name": name}
+    return client.put(SMALL, json={"project": project, "revision": revision, "label": f"rename to {name}", **more})
+
+
+def on_disk(workspace: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((workspace / "small" / "project.json").read_text())
+    return found
+
+
+def test_a_project_is_listed_with_the_state_of_its_eight_steps(client: TestClient) -> None:
+    (project,) = client.get("/api/projects").json()
+    assert (project["id"], project["name"]) == ("small", "small")
+    statuses = {name: step["status"] for name, step in project["steps"].items()}
+    assert statuses == {
+        "inputs": "done",
+        "orthoimage": "todo",
+        "correspondences": "warn",
+        "regions": "done",
+        "track": "todo",
+        "review": "todo",
+        "drift": "todo",
+        "export": "todo",
+    }
+
+
+def test_an_edit_is_on_the_disk_and_has_a_new_revision(client: TestClient, workspace: Path) -> None:
+    before = get(client)
+    after = rename(client, "other", before["revision"]).json()
+    assert after["revision"] > before["revision"]
+    assert after["undo_label"] == "rename to other"
+    assert on_disk(workspace)["name"] == "other"
+
+
+def test_an_edit_of_an_older_state_is_told_and_changes_nothing(client: TestClient, workspace: Path) -> None:
+    seen = get(client)["revision"]
+    first = rename(client, "first tab", seen)
+    second = rename(client, "second tab", seen)
+    assert (first.status_code, second.status_code) == (200, 409)
+    assert second.json()["error"]["kind"] == "conflict"
+    assert second.json()["revision"] == first.json()["revision"]
+    assert second.json()["project"]["name"] == "first tab"
+    assert on_disk(workspace)["name"] == "first tab"
+
+
+def test_undo_and_redo_survive_a_restart(client: TestClient, workspace: Path) -> None:
+    revision = get(client)["revision"]
+    for name in ("one", "two"):
+        revision = rename(client, name, revision).json()["revision"]
+    with TestClient(create_app(workspace), base_url=ADDRESS, headers=WRITE) as restarted:
+        state = get(restarted)
+        assert state["revision"] == revision
+        state = restarted.post(f"{SMALL}/undo", json={"revision": revision}).json()
+        assert (state["project"]["name"], state["redo_label"]) == ("one", "rename to two")
+        state = restarted.post(f"{SMALL}/undo", json={"revision": state["revision"]}).json()
+        assert (state["project"]["name"], state["can_undo"]) == ("small", False)
+        assert on_disk(workspace)["name"] == "small"
+        state = restarted.post(f"{SMALL}/redo", json={"revision": state["revision"]}).json()
+        assert state["project"]["name"] == "one"
+        state = rename(restarted, "three", state["revision"]).json()
+        assert not state["can_redo"]
+
+
+def test_undo_of_an_older_state_and_undo_of_nothing_are_conflicts(client: TestClient) -> None:
+    revision = get(client)["revision"]
+    nothing = client.post(f"{SMALL}/undo", json={"revision": revision})
+    assert (nothing.status_code, nothing.json()["error"]["message"]) == (409, "There is nothing to undo.")
+    rename(client, "other", revision)
+    assert client.post(f"{SMALL}/undo", json={"revision": revision}).status_code == 409
+
+
+def test_a_nudge_merges_with_the_one_before(client: TestClient) -> None:
+    state = get(client)
+    for u in (10.1, 10.2, 10.3):
+        state["project"]["correspondences"][0]["frame_px"][0] = u
+        edit = {"project": state["project"], "revision": state["revision"], "label": "nudge 1", "merge": True}
+        state = client.put(SMALL, json=edit).json()
+    entries = client.get(f"{SMALL}/history").json()["entries"]
+    assert [entry["label"] for entry in entries] == ["created", "nudge 1"]
+    undone = client.post(f"{SMALL}/undo", json={"revision": state["revision"]}).json()
+    assert undone["project"]["correspondences"][0]["frame_px"][0] == pytest.approx(9.5)
+
+
+def test_an_edit_by_hand_becomes_a_state_of_its_own(client: TestClient, workspace: Path) -> None:
+    revision = get(client)["revision"]
+    document = on_disk(workspace) | {"name": "by hand"}
+    (workspace / "small" / "project.json").write_text(json.dumps(document))
+    state = get(client)
+    assert state["revision"] > revision
+    assert (state["project"]["name"], state["undo_label"]) == ("by hand", "changed outside")
+    assert client.post(f"{SMALL}/undo", json={"revision": revision}).status_code == 409
+
+
+def test_every_problem_of_an_edit_is_told_and_nothing_is_written(client: TestClient, workspace: Path) -> None:
+    before = on_disk(workspace)
+    state = get(client)
+    wrong = state["project"] | {"method": "guess", "colour": "red"}
+    answer = client.put(SMALL, json={"project": wrong, "revision": state["revision"]})
+    assert answer.status_code == 422
+    assert {problem.partition(":")[0] for problem in answer.json()["problems"]} == {"method", "colour"}
+    assert on_disk(workspace) == before
+
+
+def test_an_input_outside_the_roots_is_refused(client: TestClient, tmp_path: Path, workspace: Path) -> None:
+    secret = tmp_path / "secret.yaml"
+    secret.write_text("x: 1")
+    (workspace / "small" / "link.yaml").symlink_to(secret)
+    state = get(client)
+    for lens in (str(secret), "../../secret.yaml", "link.yaml"):
+        project = state["project"] | {"inputs": state["project"]["inputs"] | {"lens": lens}}
+        answer = client.put(SMALL, json={"project": project, "revision": state["revision"]})
+        assert answer.status_code == 403, lens
+    assert get(client)["revision"] == state["revision"]
+
+
+def test_an_absolute_input_is_stored_relative(client: TestClient, workspace: Path) -> None:
+    (workspace / "shared.yaml").write_bytes((workspace / "small" / "lens.yaml").read_bytes())
+    state = get(client)
+    project = state["project"] | {"inputs": state["project"]["inputs"] | {"lens": str(workspace / "shared.yaml")}}
+    saved = client.put(SMALL, json={"project": project, "revision": state["revision"]}).json()
+    assert saved["project"]["inputs"]["lens"] == "../shared.yaml"
+
+
+def test_a_project_is_made_from_files_or_from_nothing(client: TestClient, workspace: Path) -> None:
+    video = workspace / "small" / "video.mp4"
+    made = client.post("/api/projects", json={"name": "Eq 7 / über", "video": str(video)}).json()["id"]
+    state = client.get(f"/api/projects/{made}").json()
+    assert state["project"]["name"] == "Eq 7 / über"
+    assert state["project"]["inputs"]["video"] == "../small/video.mp4"
+    empty = client.post("/api/projects", json={"name": "empty"}).json()["id"]
+    assert client.get(f"/api/projects/{empty}").json()["steps"]["inputs"]["status"] == "todo"
+    again = client.post("/api/projects", json={"name": "empty"}).json()["id"]
+    assert again != empty
+
+
+def test_a_project_that_cannot_be_made_leaves_nothing(client: TestClient, workspace: Path) -> None:
+    answer = client.post("/api/projects", json={"name": "gone", "video": str(workspace / "none.mp4")})
+    assert answer.status_code == 404
+    assert not (workspace / "gone").exists()
+    assert client.post("/api/projects", json={"name": " ./ "}).status_code == 422
+
+
+def test_a_copy_is_a_project_of_its_own(client: TestClient, workspace: Path) -> None:
+    copy = client.post(f"{SMALL}/duplicate", json={"name": "copy"}).json()["id"]
+    rename(client, "changed", get(client)["revision"])
+    assert client.get(f"/api/projects/{copy}").json()["project"]["name"] == "copy"
+    assert (workspace / copy / "video.mp4").read_bytes() == (workspace / "small" / "video.mp4").read_bytes()
+    client.put(f"{SMALL}/upload/lens?filename=lens.yaml", content=b"other")
+    assert (workspace / copy / "lens.yaml").read_bytes() != b"other"
+
+
+def test_the_trash_gives_back_what_it_took(client: TestClient, workspace: Path) -> None:
+    token = client.delete(SMALL).json()["undo_token"]
+    assert client.get("/api/projects").json() == []
+    assert client.get(SMALL).status_code == 404
+    assert client.post("/api/projects/untrash", json={"undo_token": token}).json() == {"id": "small"}
+    assert get(client)["project"]["name"] == "small"
+    assert client.post("/api/projects/untrash", json={"undo_token": token}).status_code == 404
+    assert client.post("/api/projects/untrash", json={"undo_token": "../../etc"}).status_code == 404
+
+
+def test_a_broken_project_file_is_listed_with_its_problem(client: TestClient, workspace: Path) -> None:
+    (workspace / "small" / "project.json").write_text("{")
+    (project,) = client.get("/api/projects").json()
+    assert project["steps"]["inputs"]["status"] == "error"
+    assert "line 1" in project["steps"]["inputs"]["message"]
+    answer = client.get(SMALL)
+    assert (answer.status_code, answer.json()["error"]["kind"]) == (422, "input")
