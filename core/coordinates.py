@@ -54,6 +54,11 @@ def invert_homography(H: ArrayLike) -> Floats:
     return inverse / inverse[2, 2]
 
 
+def finite_rows(points: Floats) -> Bools:
+    """Return which points (..., D) have all their coordinates, (...)."""
+    return np.asarray(np.isfinite(points).all(axis=-1), dtype=np.bool_)
+
+
 def finite_median(values: Floats) -> Floats:
     """Return the median of what is finite along the last axis; 0 where nothing is. Quicker than numpy's own."""
     ordered = np.sort(np.where(np.isfinite(values), values, np.inf), axis=-1)

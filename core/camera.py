@@ -1,0 +1,252 @@
+"""The pinhole camera in space: poses, projection, and robust poses of many frames at once.
+
+A pose leads from `world` (metres, z up) to the camera (x right, y down, z forward): x_camera = R (X - C). *Rays* are
+normalised undistorted image coordinates (x/z, y/z), the frame in which all geometry is done; `core.lens` leads from
+raw pixels to rays and back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.coordinates import Floats, finite_median, finite_rows
+
+# Frames solved together: bounds the memory of the normal equations to some tens of MB at 500 points a frame.
+BATCH = 96
+# Tukey's biweight at 95 % efficiency under normal noise (Holland & Welsch 1977).
+TUKEY = 4.685
+
+
+@dataclass(frozen=True)
+class Pose:
+    """One camera pose: `R` (3, 3) camera from world, `centre_m` (3,) world."""
+
+    R: Floats
+    centre_m: Floats
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """Poses of F frames from N ground points, with what they left over.
+
+    Attributes:
+        R: (F, 3, 3) camera from world.
+        centre_m: (F, 3) world.
+        residual: (F, N, 2) observed minus projected rays.
+        weight: (F, N) final robust weights; 0 for points left out.
+        normal: (F, 6, 6) normal matrix of (rotation, centre) for unit ray variance.
+        sigma: (F,) robust standard deviation of one ray coordinate.
+    """
+
+    R: Floats
+    centre_m: Floats
+    residual: Floats
+    weight: Floats
+    normal: Floats
+    sigma: Floats
+
+
+def exponential(omega: ArrayLike) -> Floats:
+    """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians (Rodrigues)."""
+    omega = np.asarray(omega, dtype=np.float64)
+    angle = np.linalg.norm(omega, axis=-1)[..., None, None]
+    K = cross_matrix(omega)
+    small = angle < 1e-8
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0 - angle**2 / 6, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - angle**2 / 24, (1.0 - np.cos(safe)) / safe**2)
+    return np.eye(3) + a * K + b * (K @ K)
+
+
+def cross_matrix(vector: ArrayLike) -> Floats:
+    """Return (..., 3, 3) matrices that multiply as the cross product with (..., 3) vectors."""
+    v = np.asarray(vector, dtype=np.float64)
+    zero = np.zeros_like(v[..., 0])
+    rows = [zero, -v[..., 2], v[..., 1], v[..., 2], zero, -v[..., 0], -v[..., 1], v[..., 0], zero]
+    return np.stack(rows, axis=-1).reshape(*v.shape[:-1], 3, 3)
+
+
+def project(R: ArrayLike, centre_m: ArrayLike, points_m: ArrayLike) -> Floats:
+    """Return rays (..., N, 2) of world points (N, 3) or (..., N, 3) seen from poses (..., 3, 3), (..., 3)."""
+    R, centre_m = np.asarray(R), np.asarray(centre_m)
+    camera = (np.asarray(points_m) - centre_m[..., None, :]) @ np.swapaxes(R, -1, -2)
+    return camera[..., :2] / camera[..., 2:]
+
+
+def intersect_height(R: ArrayLike, centre_m: ArrayLike, rays: ArrayLike, z_m: ArrayLike) -> Floats:
+    """Return the world x, y (..., N, 2) where rays (..., N, 2) meet the horizontal plane(s) z = `z_m`.
+
+    Args:
+        z_m: a height, or one per ray (..., N).
+    """
+    rays = np.asarray(rays, dtype=np.float64)
+    R, centre_m = np.asarray(R), np.asarray(centre_m)
+    directions = np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1) @ R
+    reach = (np.asarray(z_m) - centre_m[..., None, 2]) / directions[..., 2]
+    return centre_m[..., None, :2] + reach[..., None] * directions[..., :2]
+
+
+def plan_homography(pose: Pose) -> Floats:
+    """Return H_plan_ray (3, 3): from rays of one pose to metres on the ground plane z = 0."""
+    return np.asarray(plan_homographies(pose.R[None], pose.centre_m[None])[0])
+
+
+def plan_homographies(R: Floats, centre_m: Floats) -> Floats:
+    """Return H_plan_ray (F, 3, 3) of poses (F, 3, 3), (F, 3); nan where a pose is not finite."""
+    H_ray_plan = R @ np.stack(
+        [np.broadcast_to([1.0, 0.0, 0.0], centre_m.shape), np.broadcast_to([0.0, 1.0, 0.0], centre_m.shape), -centre_m],
+        axis=-1,
+    )
+    usable = np.isfinite(H_ray_plan).all(axis=(1, 2)) & (np.abs(centre_m[:, 2]) > 1e-9)
+    inverse = np.full_like(H_ray_plan, np.nan)
+    inverse[usable] = np.linalg.inv(H_ray_plan[usable])
+    return inverse
+
+
+def pose_from_homography(H_ray_plan: ArrayLike) -> Pose:
+    """Return the pose whose image of the ground plane z = 0 is nearest to a homography (Zhang 2000, eq. 8).
+
+    Args:
+        H_ray_plan: (3, 3) from plan metres to rays.
+    """
+    H = np.asarray(H_ray_plan, dtype=np.float64)
+    H = H / np.sqrt(np.linalg.norm(H[:, 0]) * np.linalg.norm(H[:, 1]))
+    candidates = []
+    for sign in (1.0, -1.0):
+        r1, r2, t = sign * H[:, 0], sign * H[:, 1], sign * H[:, 2]
+        U, _, Vt = np.linalg.svd(np.column_stack([r1, r2, np.cross(r1, r2)]))
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        candidates.append(Pose(R=R, centre_m=-R.T @ t))
+    return max(candidates, key=lambda pose: float(pose.centre_m[2]))  # the one above the ground
+
+
+def jacobians(R: Floats, centre_m: Floats, points_m: Floats) -> tuple[Floats, Floats]:
+    """Return rays (F, N, 2) and their derivatives (F, N, 2, 6) by (rotation, centre).
+
+    The rotation is perturbed on the left, R <- exp(omega) R; the centre additively, in world metres.
+    """
+    camera = (points_m - centre_m[:, None, :]) @ np.swapaxes(R, -1, -2)
+    inverse_z = 1.0 / camera[..., 2]
+    a, b = camera[..., 0] * inverse_z, camera[..., 1] * inverse_z
+    J = np.empty((*a.shape, 2, 6))
+    J[..., 0, 0], J[..., 0, 1], J[..., 0, 2] = -a * b, 1 + a * a, -b
+    J[..., 1, 0], J[..., 1, 1], J[..., 1, 2] = -(1 + b * b), a * b, a
+    rows = R[:, None, :, :]
+    J[..., 0, 3:] = (a[..., None] * rows[..., 2, :] - rows[..., 0, :]) * inverse_z[..., None]
+    J[..., 1, 3:] = (b[..., None] * rows[..., 2, :] - rows[..., 1, :]) * inverse_z[..., None]
+    return np.stack([a, b], axis=-1), J
+
+
+def fit_poses(
+    rays: Floats,
+    weight: Floats,
+    points_m: Floats,
+    start: Pose | PoseFit,
+    *,
+    iterations: int = 8,
+    robust: bool = True,
+    sigma_floor: float = 1e-6,
+    fixed_centre_m: Floats | None = None,
+) -> PoseFit:
+    """Return the robust least-squares pose of each frame from its ground points, all frames at once.
+
+    Args:
+        rays: (F, N, 2) observed, nan where not observed.
+        weight: (F, N) prior weights, 0 where not to be used.
+        points_m: (N, 3) world.
+        start: one pose for all frames, or an earlier fit of the same frames.
+        robust: whether to weigh down outliers (Tukey's biweight on a median scale).
+        sigma_floor: smallest scale of the robust weights, rays.
+        fixed_centre_m: (F, 3) camera centres to hold; only rotations are fitted then.
+    """
+    frames = len(rays)
+    if isinstance(start, Pose):
+        R0, C0 = np.repeat(start.R[None], frames, 0), np.repeat(start.centre_m[None], frames, 0)
+    else:
+        R0, C0 = start.R, start.centre_m
+    if fixed_centre_m is not None:
+        C0 = fixed_centre_m
+    unknowns = 3 if fixed_centre_m is not None else 6
+    parts = [
+        _fit_batch(
+            rays[s], weight[s], points_m, R0[s], C0[s],
+            iterations=iterations, robust=robust, sigma_floor=sigma_floor, unknowns=unknowns,
+        )
+        for s in _batches(frames)
+    ]  # fmt: skip
+    return PoseFit(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def _batches(frames: int) -> Iterator[slice]:
+    return (slice(first, first + BATCH) for first in range(0, max(frames, 1), BATCH))
+
+
+def _fit_batch(
+    rays: Floats,
+    weight: Floats,
+    points_m: Floats,
+    R: Floats,
+    C: Floats,
+    *,
+    iterations: int,
+    robust: bool,
+    sigma_floor: float,
+    unknowns: int,
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    seen = finite_rows(rays) & (weight > 0)
+    observed = np.where(seen[..., None], rays, 0.0)
+    base = np.where(seen, weight, 0.0)
+    used, sigma = base, np.full(len(rays), sigma_floor)
+    for iteration in range(iterations):
+        predicted, J = jacobians(R, C, points_m)
+        residual = observed - predicted
+        if robust:
+            sigma = np.maximum(robust_sigma(residual, seen), sigma_floor)
+            # A wide funnel first, so that a poor start does not throw good points out.
+            funnel = 4.0 if iteration < 2 else 1.0
+            used = base * _tukey(residual, funnel * sigma)
+        A, g = _normal(J[..., :unknowns], residual, used)
+        step = _solve_damped(A, g)
+        R = exponential(step[:, :3]) @ R
+        if unknowns == 6:
+            C = C + step[:, 3:]
+        if np.abs(step).max(initial=0.0) < 1e-12:
+            break
+    predicted, J = jacobians(R, C, points_m)
+    residual = np.where(seen[..., None], observed - predicted, np.nan)
+    normal, _ = _normal(J, np.zeros_like(observed), used)
+    return R, C, residual, used, normal, np.maximum(robust_sigma(residual, used > 0), sigma_floor)
+
+
+def _normal(J: Floats, residual: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    frames, points, _, unknowns = J.shape
+    flat = J.reshape(frames, points * 2, unknowns)
+    weighted = (J * weight[..., None, None]).reshape(frames, points * 2, unknowns)
+    transposed = np.swapaxes(weighted, -1, -2)
+    return transposed @ flat, (transposed @ residual.reshape(frames, points * 2, 1))[..., 0]
+
+
+def _solve_damped(A: Floats, g: Floats) -> Floats:
+    """Solve each small system after scaling; frames with too few points take no step instead of failing all."""
+    scale = np.sqrt(np.maximum(np.diagonal(A, axis1=-2, axis2=-1), 1e-300))
+    scaled = A / (scale[..., :, None] * scale[..., None, :]) + 1e-10 * np.eye(A.shape[-1])
+    usable = np.isfinite(scaled).all(axis=(-2, -1)) & (np.abs(A).max(axis=(-2, -1)) > 0)
+    scaled[~usable] = np.eye(A.shape[-1])
+    step = np.linalg.solve(scaled, (g / scale)[..., None])[..., 0] / scale
+    return np.where(usable[:, None] & np.isfinite(step), step, 0.0)
+
+
+def robust_sigma(residual: Floats, seen: NDArray[np.bool_]) -> Floats:
+    """Return each frame's standard deviation of one coordinate, (F,), from the median absolute residual."""
+    magnitude = np.where(seen[..., None], np.abs(residual), np.nan).reshape(len(residual), -1)
+    return 1.4826 * finite_median(magnitude)
+
+
+def _tukey(residual: Floats, sigma: Floats) -> Floats:
+    # Two coordinates together: the median of a Rayleigh variable is 1.18 sigma, so the cut keeps its meaning per axis.
+    ratio = (residual**2).sum(axis=-1) / (2.0 * (TUKEY * sigma[:, None]) ** 2)
+    return np.where(ratio < 1.0, (1.0 - np.minimum(ratio, 1.0)) ** 2, 0.0)

@@ -1,0 +1,277 @@
+"""Following a target from frame to frame in pictures alone: where to look next, and what to do when it is lost.
+
+While following, positions are *rays of the reference frame*: a frame's ground homography H_ray_ray0 takes out the
+camera, and what remains is the target's apparent motion (its own, and parallax). None of this enters the result; it
+only has to be good to a few pixels, and the measurement then finds its own place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.coordinates import Floats, apply_homography, finite_rows
+from core.ground import LEAST_SCORE, choose_features_within, homography_jacobian
+from core.lens import Lens
+from core.motion import LineSet, RigidFit, fit_line, is_determined, rigid_from_lines, rigid_from_points
+from core.patches import PatchTracker
+from core.project import LINE_NAMES, Target
+from core.roof_lines import NOT_FOUND, STATIONS, LineMatch, LineTracker
+from core.video import Luma
+
+# Correlation of the whole target's picture below which it is not recognised.
+LEAST_LIKENESS = 0.35
+# How far a target is searched for around its place in the reference frame, plan metres: 0.8 m of motion, enlarged by
+# its height, and as much parallax.
+SEARCH_M = 2.4
+# Roof motion between two frames changes by up to some 8 cm when it shakes hardest (3 Hz at 4 m/s, 30 Hz video).
+LINE_SEARCH_M = 0.14
+# Every so many frames the whole picture confirms that no neighbouring strip has been taken.
+CONFIRM_EVERY = 15
+POINTS = 160
+
+
+@dataclass(frozen=True)
+class Apparent:
+    """Apparent rigid motion of a target in rays of the reference frame."""
+
+    shift: Floats
+    rotation_rad: float
+
+    @staticmethod
+    def none() -> Apparent:
+        """Return the state of rest."""
+        return Apparent(np.zeros(2), 0.0)
+
+    def towards(self, earlier: Apparent, factor: float) -> Apparent:
+        """Return the motion extrapolated from an earlier one by `factor` of the step between the two."""
+        return Apparent(
+            self.shift + factor * (self.shift - earlier.shift),
+            self.rotation_rad + factor * (self.rotation_rad - earlier.rotation_rad),
+        )
+
+    def apply(self, points: Floats, centre: Floats) -> Floats:
+        """Return where points (..., 2) of the reference frame have moved."""
+        c, s = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
+        return np.asarray((points - centre) @ np.array([[c, s], [-s, c]]) + centre + self.shift)
+
+
+@dataclass(frozen=True)
+class TargetMatch:
+    """A target in one frame.
+
+    Attributes:
+        raw: measured raw pixels: (L, STATIONS, 2, 2) edges of lines, or (N, 2) patches of points; nan where none.
+        apparent: its motion, or None where it could not be determined.
+    """
+
+    raw: Floats
+    apparent: Apparent | None
+
+
+class Follower(Protocol):
+    """Finds one target in a frame, given the camera."""
+
+    reference_raw: Floats
+
+    def find(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool) -> TargetMatch:
+        """Return the target in a frame, searched for without a prediction where that is None or misleads."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How large plan metres appear in the reference frame near a target."""
+
+    rays_per_m: float
+    pixels_per_m: float
+
+
+def make_follower(luma: Luma, target: Target, to_ray0: Callable[[Floats], Floats], lens: Lens) -> Follower:
+    """Return a follower for a target.
+
+    Args:
+        luma: the reference frame.
+        to_ray0: from plan metres (N, 2) to rays of the reference frame.
+
+    Raises:
+        InputError: a band holds no line, or a region no texture.
+    """
+    if target.lines is not None and target.kind == "lines":
+        bands = [getattr(target.lines, name) for name in LINE_NAMES]
+        corners = np.array([[band.from_m, band.to_m] for band in bands])
+        scale = _scale(corners.reshape(-1, 2), to_ray0, lens)
+        widths = [band.width_m * scale.pixels_per_m for band in bands]
+        names = [f"project.json: targets.{target.name}.lines.{name}" for name in LINE_NAMES]
+        ends = to_ray0(corners.reshape(-1, 2)).reshape(-1, 2, 2)
+        return LinesFollower(luma, ends, lens, widths_px=widths, scale=scale, names=names)
+    region = np.array(target.region_m)
+    scale = _scale(region, to_ray0, lens)
+    return PointsFollower(luma, to_ray0(region), lens, scale=scale, name=f"project.json: targets.{target.name}")
+
+
+def _scale(plan_m: Floats, to_ray0: Callable[[Floats], Floats], lens: Lens) -> Scale:
+    centre = plan_m.mean(axis=0)
+    rays = to_ray0(centre + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]))
+    raw = lens.raw_from_rays(rays)
+    along = [float(np.linalg.norm(points[1] - points[0])) for points in (rays[:2], rays[2:], raw[:2], raw[2:])]
+    return Scale(rays_per_m=(along[0] + along[1]) / 2, pixels_per_m=(along[2] + along[3]) / 2)
+
+
+class LinesFollower:
+    """Follows L1, L2 and T1 of a target together."""
+
+    def __init__(
+        self, luma: Luma, ends: Floats, lens: Lens, *, widths_px: list[float], scale: Scale, names: list[str]
+    ) -> None:
+        self._lens = lens
+        self._search_px = LINE_SEARCH_M * scale.pixels_per_m
+        self._centre = ends.reshape(-1, 2).mean(axis=0)
+        still = self._mapping(np.eye(3), Apparent.none())
+        self.trackers = [
+            LineTracker(luma, end, still, width_px=width, name=name)
+            for end, width, name in zip(ends, widths_px, names, strict=True)
+        ]
+        self.reference_raw = np.stack([tracker.find(luma, still).edges_raw for tracker in self.trackers])
+        rays = lens.rays_from_raw(self.reference_raw.mean(axis=2))
+        lines = [fit_line(points, np.ones(STATIONS), self._centre) for points in rays]
+        self._lines = LineSet(np.array([n for n, _ in lines]), np.array([o for _, o in lines]), self._centre)
+        self._finder = TargetFinder(luma, ends.reshape(-1, 2), lens, scale)
+
+    def find(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool) -> TargetMatch:
+        """Return the lines in a frame; see `Follower.find`."""
+        found = self._measure(luma, H_ray_ray0, predicted) if predicted is not None else None
+        if found is not None and found.apparent is not None and not confirm:
+            return found
+        seen = self._finder.search(luma, H_ray_ray0)
+        if seen is None:
+            return found or TargetMatch(np.full_like(self.reference_raw, np.nan), None)
+        if found is not None and found.apparent is not None and self._finder.agrees(seen, found.apparent):
+            return found
+        rotation = predicted.rotation_rad if predicted is not None else 0.0
+        return self._measure(luma, H_ray_ray0, Apparent(seen, rotation))
+
+    def _measure(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent) -> TargetMatch:
+        to_raw = self._mapping(H_ray_ray0, predicted)
+        matches = [tracker.find(luma, to_raw, search_px=self._search_px) for tracker in self.trackers]
+        apparent = self._apparent(matches, H_ray_ray0)
+        return TargetMatch(np.stack([match.edges_raw for match in matches]), apparent)
+
+    def _apparent(self, matches: list[LineMatch], H_ray_ray0: Floats) -> Apparent | None:
+        usable = [match if match.measured >= STATIONS // 4 else NOT_FOUND for match in matches]
+        rays = self._lens.rays_from_raw(np.stack([match.midline_raw for match in usable]))
+        rays0 = apply_homography(np.linalg.inv(H_ray_ray0), rays)
+        fit = rigid_from_lines(rays0[None], np.ones((1, *rays0.shape[:2])), self._lines)
+        return _apparent_of(fit)
+
+    def _mapping(self, H_ray_ray0: Floats, apparent: Apparent) -> Callable[[Floats], Floats]:
+        def to_raw(rays0: Floats) -> Floats:
+            return self._lens.raw_from_rays(apply_homography(H_ray_ray0, apparent.apply(rays0, self._centre)))
+
+        return to_raw
+
+
+class PointsFollower:
+    """Follows a textured target by patches spread over its region."""
+
+    def __init__(self, luma: Luma, region: Floats, lens: Lens, *, scale: Scale, name: str) -> None:
+        self._lens = lens
+        points = choose_features_within(luma, lens.raw_from_rays(region), POINTS, name)
+        self.reference_raw = points
+        self._patches = PatchTracker(luma, points)
+        self._rays0 = lens.rays_from_raw(points)
+        self._J0_inverse = np.linalg.inv(lens.jacobian_raw_rays(self._rays0))
+        self._centre = self._rays0.mean(axis=0)
+        self._finder = TargetFinder(luma, region, lens, scale)
+
+    def find(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool) -> TargetMatch:
+        """Return the patches in a frame; see `Follower.find`."""
+        found = self._measure(luma, H_ray_ray0, predicted) if predicted is not None else None
+        if found is not None and found.apparent is not None:
+            return found
+        seen = self._finder.search(luma, H_ray_ray0)
+        if seen is None:
+            return TargetMatch(np.full_like(self.reference_raw, np.nan), None)
+        rotation = predicted.rotation_rad if predicted is not None else 0.0
+        coarse = self._measure(luma, H_ray_ray0, Apparent(seen, rotation))
+        return coarse if coarse.apparent is None else self._measure(luma, H_ray_ray0, coarse.apparent)
+
+    def _measure(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent) -> TargetMatch:
+        moved = predicted.apply(self._rays0, self._centre)
+        rays = apply_homography(H_ray_ray0, moved)
+        c, s = np.cos(predicted.rotation_rad), np.sin(predicted.rotation_rad)
+        turn = np.array([[c, -s], [s, c]])
+        J = self._lens.jacobian_raw_rays(rays) @ homography_jacobian(H_ray_ray0, moved) @ turn @ self._J0_inverse
+        matches = self._patches.track(luma, self._lens.raw_from_rays(rays), np.linalg.inv(J))
+        raw = np.where((matches.score >= LEAST_SCORE)[:, None], matches.raw, np.nan)
+        rays0 = apply_homography(np.linalg.inv(H_ray_ray0), self._lens.rays_from_raw(raw))
+        if finite_rows(raw).sum() < max(6, len(raw) // 4):
+            return TargetMatch(np.full_like(raw, np.nan), None)
+        fit = rigid_from_points(rays0[None], np.ones((1, len(rays0))), self._rays0, self._centre)
+        return TargetMatch(raw, _apparent_of(fit))
+
+
+def _apparent_of(fit: RigidFit) -> Apparent | None:
+    if not is_determined(fit.normal)[0]:
+        return None
+    return Apparent(fit.shift[0], float(fit.rotation_rad[0]))
+
+
+class TargetFinder:
+    """Recognises a whole target by its picture, wherever it has moved.
+
+    Hatches, cables and corners tell apart what equal strips do not.
+    """
+
+    def __init__(self, luma: Luma, outline: Floats, lens: Lens, scale: Scale) -> None:
+        self._lens = lens
+        # About a strip's width per sample, so that strips still show and the search stays small.
+        self._factor = max(1, round(0.035 * scale.pixels_per_m))
+        self._step = self._factor / float(lens.focal_px.mean())
+        self._reach = int(np.ceil(SEARCH_M * scale.rays_per_m / self._step))
+        self._tolerance = 0.15 * scale.rays_per_m
+        low, high = outline.min(axis=0), outline.max(axis=0)
+        self._low = low
+        self._size = np.maximum(np.ceil((high - low) / self._step).astype(np.int64) + 1, 8)
+        self._template = self._picture(luma, np.eye(3), 0)
+
+    def search(self, luma: Luma, H_ray_ray0: Floats) -> Floats | None:
+        """Return the target's apparent shift (2,) in rays of the reference frame, or None if it is not recognised."""
+        wide = self._picture(luma, H_ray_ray0, self._reach)
+        likeness = cv2.matchTemplate(wide, self._template, cv2.TM_CCOEFF_NORMED)
+        _, best, _, (u, v) = cv2.minMaxLoc(likeness)
+        if best < LEAST_LIKENESS:
+            return None
+        return (np.array([u, v], dtype=np.float64) - self._reach) * self._step
+
+    def agrees(self, shift: Floats, apparent: Apparent) -> bool:
+        """Whether a tracked motion is the one the whole picture shows."""
+        return bool(np.linalg.norm(shift - apparent.shift) < self._tolerance)
+
+    def _picture(self, luma: Luma, H_ray_ray0: Floats, reach: int) -> NDArray[np.uint8]:
+        """Return the reduced picture of the target's surroundings, in the reference frame's geometry."""
+        size = self._size + 2 * reach
+        low = self._low - reach * self._step
+        # The map is smooth: computed at some places and interpolated in between.
+        knots = [np.linspace(0.0, float(n - 1), 17) for n in size]
+        u, v = np.meshgrid(*knots)
+        rays0 = low + np.stack([u, v], axis=-1) * self._step
+        raw = self._lens.raw_from_rays(apply_homography(H_ray_ray0, rays0)).astype(np.float32)
+        grid = np.stack(np.meshgrid(*[np.arange(n, dtype=np.float32) * np.float32(16 / (n - 1)) for n in size]), -1)
+        full = cv2.remap(np.nan_to_num(raw, nan=-1e4), grid[..., 0], grid[..., 1], cv2.INTER_LINEAR)
+        return _reduced(luma, np.asarray(full, dtype=np.float32), self._factor)
+
+
+def _reduced(luma: Luma, raw: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
+    """Sample a frame at raw pixels (h, w, 2), averaged over squares of `factor` pixels; grey beyond the frame."""
+    height, width = luma.shape
+    low = np.clip(np.floor(raw.min(axis=(0, 1))) - factor, 0, [width - 1, height - 1]).astype(int)
+    high = np.clip(np.ceil(raw.max(axis=(0, 1))) + factor + 1, low + 1, [width, height]).astype(int)
+    block = cv2.blur(np.ascontiguousarray(luma[low[1] : high[1], low[0] : high[0]]), (factor, factor))
+    u, v = raw[..., 0] - np.float32(low[0]), raw[..., 1] - np.float32(low[1])
+    sampled = cv2.remap(block, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=128)
+    return np.asarray(sampled, dtype=np.uint8)

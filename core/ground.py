@@ -1,0 +1,244 @@
+"""The ground: natural features of the reference frame, followed through the video, and the homography they give.
+
+Features are chosen once, in the reference frame, outside the moving regions, evenly spread. The homography of every
+frame serves to predict where to look; the camera poses of the result are solved later, from the recorded positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.coordinates import Bools, Floats, apply_homography, finite_rows
+from core.errors import InputError
+from core.lens import Lens
+from core.patches import HALF_PX, MARGIN_PX, Matches, PatchTracker
+from core.video import Luma
+
+FEATURES = 420
+# Correlation below which a patch shows something else than in the reference frame.
+LEAST_SCORE = 0.6
+# Ground points needed before a frame's homography is believed.
+LEAST_POINTS = 12
+# Width of the reduced picture in which a lost camera is found again, pixels.
+SEARCH_WIDTH = 960
+
+
+@dataclass(frozen=True)
+class GroundMatch:
+    """The ground in one frame.
+
+    Attributes:
+        matches: of the features, in raw pixels.
+        H_ray_ray0: (3, 3) from rays of the reference frame to rays of this frame.
+        inliers: number of features that agree with it.
+    """
+
+    matches: Matches
+    H_ray_ray0: Floats
+    inliers: int
+
+
+def choose_features(luma: Luma, moving_regions_px: Sequence[Sequence[tuple[float, float]]], count: int) -> Floats:
+    """Return about `count` corners (N, 2) of the reference frame, raw pixels, evenly spread outside the regions.
+
+    Raises:
+        InputError: too little of the ground is left to hold on to.
+    """
+    points = _spread_corners(luma, ground_mask(luma.shape, moving_regions_px), count)
+    if len(points) < LEAST_POINTS:
+        raise InputError(
+            f"project.json: moving_regions_px leave only {len(points)} ground features in the reference frame; "
+            "draw them closer around what moves, or choose another reference_frame"
+        )
+    return points
+
+
+def choose_features_within(luma: Luma, region_raw: Floats, count: int, name: str) -> Floats:
+    """Return about `count` corners (N, 2) of the reference frame inside a polygon (M, 2), raw pixels.
+
+    Raises:
+        InputError: the region shows too little texture; `name` says which.
+    """
+    region: Luma = np.zeros(luma.shape, dtype=np.uint8)
+    cv2.fillPoly(region, [np.rint(np.nan_to_num(region_raw, nan=-1e4)).astype(np.int32)], 1)
+    inside = cv2.erode(region, np.ones((2 * HALF_PX + 1, 2 * HALF_PX + 1), np.uint8)).astype(bool)
+    points = _spread_corners(luma, inside & ground_mask(luma.shape, ()), count)
+    if len(points) < 6:
+        raise InputError(f"{name}.region_m shows too little texture to follow; enlarge it, or mark lines instead")
+    return points
+
+
+def _spread_corners(luma: Luma, allowed: NDArray[np.bool_], count: int) -> Floats:
+    """Return the strongest corner of each of about `count` cells of the allowed pixels, (N, 2) raw.
+
+    Source: Shi & Tomasi (1994) for the measure of strength.
+    """
+    height, width = luma.shape
+    smooth = cv2.GaussianBlur(luma, (0, 0), 1.0)
+    quality = np.where(allowed, cv2.cornerMinEigenVal(smooth, blockSize=2 * HALF_PX + 1, ksize=3), 0.0)
+    cell = max(HALF_PX, int(np.sqrt(max(int(np.count_nonzero(allowed)), 1) / count)))
+    points, strengths = _best_of_cells(quality, cell)
+    # What is weaker than a hundredth of the median is plain surface; its position would be noise.
+    floor = 0.01 * float(np.median(strengths)) if len(strengths) else 0.0
+    points = points[strengths > max(floor, 1e-7)]
+    # Corners sit on whole pixels; spread over all sub-pixel phases, interpolation errors average out.
+    golden = (np.arange(len(points))[:, None] * np.array([0.7548776662, 0.5698402910])) % 1.0 - 0.5
+    points = points + golden
+    border = HALF_PX + MARGIN_PX + 1
+    inside = (points >= border).all(axis=1) & (points < np.array([width, height]) - 1 - border).all(axis=1)
+    return np.asarray(points[inside], dtype=np.float64)
+
+
+def ground_mask(
+    shape: tuple[int, ...], moving_regions_px: Sequence[Sequence[tuple[float, float]]]
+) -> NDArray[np.bool_]:
+    """Return the (height, width) mask of raw pixels whose patches lie inside the frame and outside what moves."""
+    mask: Luma = np.ones(shape[:2], dtype=np.uint8)
+    for region in moving_regions_px:
+        cv2.fillPoly(mask, [np.rint(np.array(region)).astype(np.int32)], 0)
+    reach = HALF_PX + MARGIN_PX + 2
+    framed = cv2.copyMakeBorder(mask, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    kept = cv2.erode(framed, np.ones((2 * reach - 1, 2 * reach - 1), np.uint8))
+    return np.asarray(kept[1:-1, 1:-1] > 0, dtype=np.bool_)
+
+
+def _best_of_cells(quality: NDArray[np.float32], cell: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the strongest place of each square cell, (N, 2) as u, v, and its strength (N,)."""
+    height, width = quality.shape
+    rows, columns = -(-height // cell), -(-width // cell)
+    padded = np.zeros((rows * cell, columns * cell), dtype=quality.dtype)
+    padded[:height, :width] = quality
+    cells = padded.reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3).reshape(rows * columns, cell * cell)
+    best = cells.argmax(axis=1)
+    number = np.arange(rows * columns)
+    points = np.stack([number % columns * cell + best % cell, number // columns * cell + best // cell], axis=1)
+    strength = cells[number, best]
+    return points[strength > 0], strength[strength > 0]
+
+
+class GroundTracker:
+    """Finds the reference frame's ground features in other frames.
+
+    Args:
+        luma: the reference frame.
+        points_raw: (N, 2) features, raw pixels.
+        lens: for predictions only; an ideal lens serves where none is known.
+        allowed: (height, width) pixels of the reference frame that show the ground, as `ground_mask`.
+    """
+
+    def __init__(self, luma: Luma, points_raw: Floats, lens: Lens, allowed: NDArray[np.bool_]) -> None:
+        self.patches = PatchTracker(luma, points_raw)
+        self._lens = lens
+        self._rays0 = lens.rays_from_raw(points_raw)
+        self._J0_inverse = np.linalg.inv(lens.jacobian_raw_rays(self._rays0))
+        self._finder = CameraFinder(luma, lens, allowed)
+
+    def find(self, luma: Luma, predicted_H_ray_ray0: Floats | None) -> GroundMatch | None:
+        """Return the ground in a frame, or None where it cannot be recognised.
+
+        Args:
+            luma: the frame.
+            predicted_H_ray_ray0: from the frames before; None to search without a prediction.
+        """
+        if predicted_H_ray_ray0 is not None:
+            found = self._refine(luma, predicted_H_ray_ray0)
+            if found is not None and found.inliers >= max(LEAST_POINTS, len(self.patches) // 4):
+                return found
+        searched = self._finder.search(luma)
+        if searched is None:
+            return None
+        coarse = self._refine(luma, searched)
+        # The search is good to a few pixels: a second pass from its result gets every patch home.
+        return self._refine(luma, coarse.H_ray_ray0) if coarse is not None else None
+
+    def _refine(self, luma: Luma, H_ray_ray0: Floats) -> GroundMatch | None:
+        predicted, ref_from_current = self.predict(H_ray_ray0)
+        matches = self.patches.track(luma, predicted, ref_from_current)
+        good = np.flatnonzero(matches.score >= LEAST_SCORE)
+        if len(good) < LEAST_POINTS:
+            return None
+        focal = float(self._lens.focal_px.mean())
+        rays = self._lens.rays_from_raw(matches.raw[good])
+        H, inlier = fit_homography(self._rays0[good], rays, tolerance=1.0 / focal)
+        if H is None or inlier.sum() < LEAST_POINTS:
+            return None
+        return GroundMatch(matches=matches, H_ray_ray0=H, inliers=int(inlier.sum()))
+
+    def predict(self, H_ray_ray0: Floats) -> tuple[Floats, Floats]:
+        """Return where the features should be (N, 2) raw and their deformation (N, 2, 2), reference by frame."""
+        rays = apply_homography(H_ray_ray0, self._rays0)
+        J = self._lens.jacobian_raw_rays(rays) @ homography_jacobian(H_ray_ray0, self._rays0) @ self._J0_inverse
+        usable: Bools = np.asarray(np.isfinite(J).all(axis=(1, 2)))
+        J[~usable] = np.eye(2)
+        raw = np.where(usable[:, None], self._lens.raw_from_rays(rays), np.nan)
+        return raw, np.linalg.inv(J)
+
+
+def homography_jacobian(H: Floats, points: Floats) -> Floats:
+    """Return the derivatives (N, 2, 2) of `apply_homography(H, points)` by the points (N, 2)."""
+    mapped = points @ H[:, :2].T + H[:, 2]
+    xy = mapped[:, :2] / mapped[:, 2:]
+    return np.asarray((H[:2, :2] - xy[:, :, None] * H[2, :2]) / mapped[:, 2, None, None])
+
+
+def fit_homography(source: Floats, target: Floats, *, tolerance: float) -> tuple[Floats | None, NDArray[np.bool_]]:
+    """Return the robust homography target <- source and which of the N points agree within `tolerance`.
+
+    Args:
+        source, target: (N, 2), rays.
+    """
+    H, mask = cv2.findHomography(source, target, cv2.RANSAC, 3.0 * tolerance, maxIters=300, confidence=0.999)
+    # OpenCV's stubs promise a matrix, but degenerate points give none.
+    found: Floats | None = None if H is None else np.asarray(H, dtype=np.float64)
+    if found is None:
+        return None, np.zeros(len(source), dtype=bool)
+    error = np.linalg.norm(apply_homography(found, source) - target, axis=1)
+    return found, (mask.ravel() > 0) & (error < 3.0 * tolerance)
+
+
+class CameraFinder:
+    """Recognises the ground without a prediction: after a cut, at the start of a chunk, after a gust.
+
+    SIFT on pictures reduced to about a quarter; it serves only until the patches take over.
+    """
+
+    def __init__(self, luma: Luma, lens: Lens, allowed: NDArray[np.bool_]) -> None:
+        self._lens = lens
+        self._factor = max(1, round(luma.shape[1] / SEARCH_WIDTH))
+        # OpenCV's detectors differ in their defaults from build to build, so they are written out.
+        self._detector = cv2.SIFT.create(nfeatures=1500, contrastThreshold=0.02)
+        # A roof full of features would win the vote for the homography and move the ground instead.
+        self._points0, self._descriptors0 = self._detect(luma, allowed)
+        self._matcher = cv2.BFMatcher(cv2.NORM_L2)
+
+    def search(self, luma: Luma) -> Floats | None:
+        """Return H_ray_ray0 (3, 3), good to a few pixels, or None."""
+        points, descriptors = self._detect(luma, None)
+        if len(points) < LEAST_POINTS or len(self._points0) < LEAST_POINTS:
+            return None
+        pairs = [m for m in self._matcher.knnMatch(descriptors, self._descriptors0, k=2) if len(m) == 2]
+        kept = [(m.queryIdx, m.trainIdx) for m, second in pairs if m.distance < 0.8 * second.distance]
+        if len(kept) < LEAST_POINTS:
+            return None
+        index = np.array(kept)
+        tolerance = self._factor / float(self._lens.focal_px.mean())
+        source, target = self._points0[index[:, 1]], points[index[:, 0]]
+        usable = finite_rows(source) & finite_rows(target)
+        H, inlier = fit_homography(source[usable], target[usable], tolerance=tolerance)
+        return H if inlier.sum() >= LEAST_POINTS else None
+
+    def _detect(self, luma: Luma, allowed: NDArray[np.bool_] | None) -> tuple[Floats, NDArray[np.float32]]:
+        size = (luma.shape[1] // self._factor, luma.shape[0] // self._factor)
+        small = cv2.resize(luma, size, interpolation=cv2.INTER_AREA)
+        mask = None if allowed is None else cv2.resize(allowed.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        keypoints, descriptors = self._detector.detectAndCompute(small, mask)
+        if not keypoints:
+            return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
+        scale = np.array(luma.shape[::-1]) / np.array(small.shape[::-1])
+        raw = (np.array([k.pt for k in keypoints], dtype=np.float64) + 0.5) * scale - 0.5
+        return self._lens.rays_from_raw(raw), np.asarray(descriptors, dtype=np.float32)

@@ -1,0 +1,249 @@
+"""`results/frames.sqlite`: what one pass over the video measured, in raw pixels, committed as it comes.
+
+A *recording* belongs to one method and one fingerprint of everything that decides what is measured (video, reference
+frame, moving regions, bands). Geometry, clicks, lens and intervals are not among it: they are applied when solving.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.coordinates import Floats
+from core.errors import InputError
+from core.following import Apparent
+
+# At most this much work is lost when the machine stops.
+COMMIT_EVERY_S = 0.8
+FORMAT = 1
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS recordings (
+    id INTEGER PRIMARY KEY, method TEXT NOT NULL, fingerprint TEXT NOT NULL, finished INTEGER NOT NULL DEFAULT 0,
+    targets TEXT NOT NULL, reference BLOB NOT NULL, UNIQUE (method, fingerprint));
+CREATE TABLE IF NOT EXISTS frames (
+    recording INTEGER NOT NULL REFERENCES recordings(id) ON DELETE CASCADE, frame INTEGER NOT NULL,
+    time_s REAL NOT NULL, measured BLOB NOT NULL, PRIMARY KEY (recording, frame)) WITHOUT ROWID;
+"""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What is looked for, as found in the reference frame, raw pixels.
+
+    Attributes:
+        ground_raw: (N, 2) ground features.
+        targets_raw: per target, (L, S, 2, 2) edges of lines or (M, 2) patches of points.
+    """
+
+    ground_raw: Floats
+    targets_raw: Mapping[str, Floats]
+
+
+@dataclass(frozen=True)
+class FrameMeasurement:
+    """What one frame showed.
+
+    Attributes:
+        H_ray_ray0: (3, 3) homography of the ground from the reference frame; nan where the ground was not recognised.
+        ground_raw: (N, 2), nan where a feature was not found.
+        targets_raw: as in `Reference`, nan where not found.
+        apparent: each target's apparent motion, None where undetermined; a prediction, never a result.
+    """
+
+    frame: int
+    time_s: float
+    H_ray_ray0: Floats
+    ground_raw: Floats
+    targets_raw: Mapping[str, Floats]
+    apparent: Mapping[str, Apparent | None]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """All frames measured so far, in presentation order, as arrays (F, ...)."""
+
+    method: str
+    finished: bool
+    reference: Reference
+    frame: NDArray[np.int64]
+    time_s: Floats
+    H_ray_ray0: Floats
+    ground_raw: Floats
+    targets_raw: Mapping[str, Floats]
+
+
+class MeasurementStore:
+    """The open file; one writer at a time.
+
+    Raises:
+        InputError: the file exists and is something else.
+    """
+
+    def __init__(self, file: Path) -> None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        self._file = file
+        try:
+            self._db = sqlite3.connect(file, timeout=20.0)
+            self._db.execute("PRAGMA foreign_keys = ON")
+            self._db.executescript(_SCHEMA)
+        except sqlite3.DatabaseError as error:
+            raise InputError(f"{file}: is not readable ({error}); delete it, it can be measured again.") from None
+        self._last_commit = time.monotonic()
+
+    def __enter__(self) -> MeasurementStore:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._db.commit()
+        self._db.close()
+
+    def find(self, method: str, fingerprint: str) -> int | None:
+        """Return the number of a recording, or None."""
+        query = "SELECT id FROM recordings WHERE method = ? AND fingerprint = ?"
+        row = self._db.execute(query, (method, fingerprint)).fetchone()
+        return None if row is None else int(row[0])
+
+    def begin(self, method: str, fingerprint: str, reference: Reference) -> int:
+        """Start a recording, taking the place of earlier ones of the same method; return its number."""
+        names = list(reference.targets_raw)
+        arrays = [reference.ground_raw, *(reference.targets_raw[name] for name in names)]
+        with self._db:
+            self._db.execute("DELETE FROM recordings WHERE method = ?", (method,))
+            cursor = self._db.execute(
+                "INSERT INTO recordings (method, fingerprint, targets, reference) VALUES (?, ?, ?, ?)",
+                (method, fingerprint, json.dumps(names), _packed(arrays)),
+            )
+        return int(cursor.lastrowid or 0)
+
+    def delete(self, method: str) -> None:
+        """Forget what was measured by a method."""
+        with self._db:
+            self._db.execute("DELETE FROM recordings WHERE method = ?", (method,))
+
+    def append(self, recording: int, measured: FrameMeasurement) -> None:
+        """Add a frame; it is safe on disk within a second."""
+        names = list(measured.targets_raw)
+        states = [_state(measured.apparent[name]) for name in names]
+        arrays = [measured.ground_raw, *(measured.targets_raw[name] for name in names)]
+        blob = np.concatenate([measured.H_ray_ray0.ravel(), *states]).astype("<f8").tobytes() + _packed(arrays)
+        self._db.execute(
+            "INSERT OR REPLACE INTO frames (recording, frame, time_s, measured) VALUES (?, ?, ?, ?)",
+            (recording, measured.frame, measured.time_s, blob),
+        )
+        if time.monotonic() - self._last_commit > COMMIT_EVERY_S:
+            self.commit()
+
+    def commit(self) -> None:
+        """Make everything appended so far safe."""
+        self._db.commit()
+        self._last_commit = time.monotonic()
+
+    def finish(self, recording: int) -> None:
+        """Mark a recording as complete."""
+        with self._db:
+            self._db.execute("UPDATE recordings SET finished = 1 WHERE id = ?", (recording,))
+
+    def is_finished(self, recording: int) -> bool:
+        """Whether the whole video has been measured."""
+        row = self._db.execute("SELECT finished FROM recordings WHERE id = ?", (recording,)).fetchone()
+        return bool(row and row[0])
+
+    def measured_frames(self, recording: int) -> list[int]:
+        """Return the numbers of the frames measured so far, ascending."""
+        rows = self._db.execute("SELECT frame FROM frames WHERE recording = ? ORDER BY frame", (recording,))
+        return [int(row[0]) for row in rows]
+
+    def reference(self, recording: int) -> Reference:
+        """Return what the recording looks for."""
+        query = "SELECT targets, reference FROM recordings WHERE id = ?"
+        names, blob = self._db.execute(query, (recording,)).fetchone()
+        ground, *targets = _unpacked(blob)
+        return Reference(ground, dict(zip(json.loads(names), targets, strict=True)))
+
+    def frame(self, recording: int, frame: int) -> FrameMeasurement | None:
+        """Return one frame, or None."""
+        query = "SELECT frame, time_s, measured FROM frames WHERE recording = ? AND frame = ?"
+        row = self._db.execute(query, (recording, frame)).fetchone()
+        return None if row is None else _measurement(row, list(self.reference(recording).targets_raw))
+
+    def load(self, recording: int) -> Recording:
+        """Return everything measured so far."""
+        reference = self.reference(recording)
+        names = list(reference.targets_raw)
+        query = "SELECT frame, time_s, measured FROM frames WHERE recording = ? ORDER BY frame"
+        frames = [_measurement(row, names) for row in self._db.execute(query, (recording,))]
+        method = self._db.execute("SELECT method FROM recordings WHERE id = ?", (recording,)).fetchone()[0]
+        stacked = {
+            name: np.array([frame.targets_raw[name] for frame in frames]).reshape(
+                -1, *reference.targets_raw[name].shape
+            )
+            for name in names
+        }
+        return Recording(
+            method=method,
+            finished=self.is_finished(recording),
+            reference=reference,
+            frame=np.array([frame.frame for frame in frames], dtype=np.int64),
+            time_s=np.array([frame.time_s for frame in frames]),
+            H_ray_ray0=np.array([frame.H_ray_ray0 for frame in frames]).reshape(-1, 3, 3),
+            ground_raw=np.array([frame.ground_raw for frame in frames]).reshape(-1, *reference.ground_raw.shape),
+            targets_raw=stacked,
+        )
+
+
+@contextmanager
+def latest_recording(file: Path, method: str) -> Iterator[tuple[MeasurementStore, int] | None]:
+    """Open the newest recording of a method, or None where nothing has been measured."""
+    if not file.exists():
+        yield None
+        return
+    with MeasurementStore(file) as store:
+        row = store._db.execute("SELECT id FROM recordings WHERE method = ?", (method,)).fetchone()
+        yield None if row is None else (store, int(row[0]))
+
+
+def _state(apparent: Apparent | None) -> Floats:
+    if apparent is None:
+        return np.full(3, np.nan)
+    return np.array([*apparent.shift, apparent.rotation_rad])
+
+
+def _measurement(row: tuple[int, float, bytes], names: list[str]) -> FrameMeasurement:
+    frame, time_s, blob = row
+    count = 9 + 3 * len(names)
+    head = np.frombuffer(blob, dtype="<f8", count=count)
+    ground, *targets = _unpacked(blob[8 * count :])
+    states = head[9:].reshape(-1, 3)
+    apparent = {
+        name: Apparent(state[:2].copy(), float(state[2])) if np.isfinite(state).all() else None
+        for name, state in zip(names, states, strict=True)
+    }
+    return FrameMeasurement(
+        frame, time_s, head[:9].reshape(3, 3).copy(), ground, dict(zip(names, targets, strict=True)), apparent
+    )
+
+
+def _packed(arrays: list[Floats]) -> bytes:
+    """Pack arrays of raw pixels: 1/8192 px is far below what any of them is known to, and small when compressed."""
+    shapes = json.dumps([array.shape for array in arrays]).encode()
+    values = np.concatenate([array.ravel() for array in arrays]) if arrays else np.empty(0)
+    ticks = np.where(np.isfinite(values), np.rint(np.nan_to_num(values) * 8192.0), np.iinfo(np.int32).min)
+    return len(shapes).to_bytes(4, "little") + shapes + zlib.compress(ticks.astype("<i4").tobytes(), 1)
+
+
+def _unpacked(blob: bytes) -> list[Floats]:
+    size = int.from_bytes(blob[:4], "little")
+    shapes = json.loads(blob[4 : 4 + size])
+    ticks = np.frombuffer(zlib.decompress(blob[4 + size :]), dtype="<i4")
+    values = np.where(ticks == np.iinfo(np.int32).min, np.nan, ticks / 8192.0)
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+    return [part.reshape(shape) for part, shape in zip(np.split(values, ends[:-1]), shapes, strict=True)]

@@ -1,0 +1,320 @@
+"""The published method's measurements, step by step: SIFT matches to the reference frame and Canny edge pairs.
+
+Features are matched by the least sum of squared differences; lines are found on the orthorectified band by Canny's
+detector as pairs of opposite edges. What is recorded are raw pixels, as for the geometric method, so that clicks and
+lens can change without reading the video again.
+
+Only those parts of a frame are looked at that the result depends on: SIFT runs on windows around the places where the
+reference features are expected, and the warp onto the ground plane is made for the three bands alone.
+
+Source: the paper, "UAV Drift and Perspective Correction" (second sub-step) and "Roof Feature Detection and Displacement
+Extraction"; SIFT (Lowe 2004) stands for SURF, which OpenCV's packages do not carry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.coordinates import Floats, apply_homography
+from core.errors import InputError
+from core.following import Apparent, Scale, TargetFinder
+from core.ground import CameraFinder, fit_homography, ground_mask
+from core.lens import Lens
+from core.measurements import FrameMeasurement, Reference
+from core.motion import LineSet, fit_line, is_determined, rigid_from_lines
+from core.prediction import MeasureSetup, nothing_measured, predict_apparent, predict_homography
+from core.project import LINE_NAMES, Band, Target
+from core.video import Luma
+
+# Matches per frame of the paper: 300-500.
+FEATURES = 600
+LEAST_MATCHES = 20
+# Half the side of the window SIFT looks into around an expected feature, pixels: the support of its descriptor at the
+# scales kept, and two pixels of prediction error.
+WINDOW_PX = 28
+LARGEST_SIZE_PX = 9.0
+# Lowe's ratio between the best and the second-best sum of squared differences.
+RATIO = 0.8
+# The orthorectified band is sampled about as finely as the camera saw it.
+CANNY_LOW, CANNY_HIGH = 40, 110
+# Stations along a band at which an edge pair may be found; the paper reports 600-1,000 edge points.
+STATIONS = 500
+LEAST_STATIONS = 40
+
+
+class PaperMeasurer:
+    """Measures frames the published way; see `core.measure.Measurer`."""
+
+    def __init__(self, luma: Luma, setup: MeasureSetup) -> None:
+        allowed = ground_mask(luma.shape, setup.moving_regions_px)
+        self._ground = SiftGround(luma, setup.lens, allowed)
+        self._targets = {target.name: _lines_target(luma, target, setup) for target in setup.targets}
+        targets_raw = {name: target.reference_raw for name, target in self._targets.items()}
+        self.reference = Reference(self._ground.points_raw, targets_raw)
+
+    def measure(self, luma: Luma, *, frame: int, time_s: float, before: Sequence[FrameMeasurement]) -> FrameMeasurement:
+        """Return what a frame shows; see `core.measure.Measurer`."""
+        found = self._ground.find(luma, predict_homography(before))
+        if found is None:
+            return nothing_measured(self.reference, frame, time_s)
+        H_ray_ray0, ground_raw = found
+        targets_raw: dict[str, Floats] = {}
+        apparent: dict[str, Apparent | None] = {}
+        for name, target in self._targets.items():
+            targets_raw[name], apparent[name] = target.find(luma, H_ray_ray0, predict_apparent(before, name, time_s))
+        return FrameMeasurement(frame, time_s, H_ray_ray0, ground_raw, targets_raw, apparent)
+
+
+class SiftGround:
+    """SIFT features of the reference frame's ground, matched in other frames."""
+
+    def __init__(self, luma: Luma, lens: Lens, allowed: NDArray[np.bool_]) -> None:
+        self._lens = lens
+        self._sift = cv2.SIFT.create(nfeatures=0, contrastThreshold=0.02)
+        keypoints, descriptors = self._sift.detectAndCompute(luma, allowed.astype(np.uint8))
+        kept = _spread_strongest(keypoints, luma.shape, FEATURES)
+        if len(kept) < LEAST_MATCHES:
+            raise InputError(
+                f"project.json: moving_regions_px leave only {len(kept)} SIFT features on the ground of the reference "
+                "frame; draw them closer around what moves, or choose another reference_frame"
+            )
+        self._descriptors = descriptors[kept]
+        self.points_raw = np.array([keypoints[i].pt for i in kept], dtype=np.float64)
+        self._rays0 = lens.rays_from_raw(self.points_raw)
+        self._finder = CameraFinder(luma, lens, allowed)
+
+    def find(self, luma: Luma, predicted_H_ray_ray0: Floats | None) -> tuple[Floats, Floats] | None:
+        """Return H_ray_ray0 and the matched features' raw pixels (N, 2), nan where unmatched; None if lost."""
+        for searching in (False, True):
+            H_guess = self._finder.search(luma) if searching else predicted_H_ray_ray0
+            if H_guess is None:
+                continue
+            matched = self._match(luma, self._lens.raw_from_rays(apply_homography(H_guess, self._rays0)))
+            good = np.isfinite(matched).all(axis=1)
+            if good.sum() < LEAST_MATCHES:
+                continue
+            rays = self._lens.rays_from_raw(matched[good])
+            H, inlier = fit_homography(self._rays0[good], rays, tolerance=1.0 / float(self._lens.focal_px.mean()))
+            if H is not None and inlier.sum() >= LEAST_MATCHES:
+                return H, matched
+        return None
+
+    def _match(self, luma: Luma, expected_raw: Floats) -> Floats:
+        """Return each feature's match among those found in the window around its expected place."""
+        windows, corners, index = _windows(luma, expected_raw)
+        matched = np.full_like(expected_raw, np.nan)
+        if not len(index):
+            return matched
+        side = 2 * WINDOW_PX
+        columns = int(np.ceil(np.sqrt(len(index))))
+        mosaic = _mosaic(windows, columns)
+        keypoints, descriptors = self._sift.detectAndCompute(mosaic, None)
+        if not keypoints:
+            return matched
+        places = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64)
+        tile = (places[:, 1] // side).astype(int) * columns + (places[:, 0] // side).astype(int)
+        inner = np.abs(places % side - WINDOW_PX).max(axis=1) < WINDOW_PX - 4
+        usable = np.flatnonzero(inner & (tile < len(index)))
+        best = self._best_of_tiles(np.asarray(descriptors, dtype=np.float32)[usable], tile[usable], index)
+        for number, candidate in best.items():
+            within = places[usable[candidate]] % side
+            matched[index[number]] = corners[number] + within
+        return matched
+
+    def _best_of_tiles(
+        self, descriptors: NDArray[np.float32], tile: NDArray[np.int64], index: NDArray[np.int64]
+    ) -> dict[int, int]:
+        """Return for each window the descriptor of least squared difference, if it is clearly the best."""
+        difference = ((descriptors - self._descriptors[index[tile]]) ** 2).sum(axis=1)
+        order = np.lexsort((difference, tile))
+        tiles, first, count = np.unique(tile[order], return_index=True, return_counts=True)
+        best: dict[int, int] = {}
+        for number, start, several in zip(tiles.tolist(), first.tolist(), count.tolist(), strict=True):
+            leading = difference[order[start]]
+            if leading < 250.0**2 and (several == 1 or leading < RATIO**2 * difference[order[start + 1]]):
+                best[number] = int(order[start])
+        return best
+
+
+def _spread_strongest(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...], count: int) -> list[int]:
+    """Return the strongest features of small size, at most a fair share from each cell of the frame."""
+    cells = 12
+    taken: dict[tuple[int, int], int] = {}
+    kept = []
+    for number in sorted(range(len(keypoints)), key=lambda i: -keypoints[i].response):
+        keypoint = keypoints[number]
+        if keypoint.size > LARGEST_SIZE_PX:
+            continue
+        cell = int(keypoint.pt[0] * cells // shape[1]), int(keypoint.pt[1] * cells // shape[0])
+        if taken.get(cell, 0) < max(1, 3 * count // cells**2):
+            taken[cell] = taken.get(cell, 0) + 1
+            kept.append(number)
+        if len(kept) == count:
+            break
+    return kept
+
+
+def _windows(luma: Luma, expected_raw: Floats) -> tuple[list[Luma], Floats, NDArray[np.int64]]:
+    height, width = luma.shape
+    corners = np.rint(np.nan_to_num(expected_raw, nan=-1e6)) - WINDOW_PX
+    inside = (corners >= 0).all(axis=1) & (corners + 2 * WINDOW_PX <= np.array([width, height])).all(axis=1)
+    index = np.flatnonzero(inside)
+    side = 2 * WINDOW_PX
+    windows = [luma[int(v) : int(v) + side, int(u) : int(u) + side] for u, v in corners[index]]
+    return windows, corners[index], index
+
+
+def _mosaic(windows: list[Luma], columns: int) -> Luma:
+    side = 2 * WINDOW_PX
+    rows = -(-len(windows) // columns)
+    mosaic = np.zeros((rows * side, columns * side), dtype=np.uint8)
+    for number, window in enumerate(windows):
+        top, left = number // columns * side, number % columns * side
+        mosaic[top : top + side, left : left + side] = window
+    return mosaic
+
+
+class CannyLines:
+    """L1, L2 and T1 of a target by Canny edge pairs on the orthorectified bands."""
+
+    def __init__(self, luma: Luma, bands: list[Band], setup: MeasureSetup, name: str) -> None:
+        self._lens = setup.lens
+        corners = np.array([[band.from_m, band.to_m] for band in bands])
+        ends = setup.rays_from_plan(corners.reshape(-1, 2)).reshape(-1, 2, 2)
+        self._centre = ends.reshape(-1, 2).mean(axis=0)
+        self._grids = [_band_grid(band, setup) for band in bands]
+        span_m = float(np.linalg.norm(corners[0, 1] - corners[0, 0]))
+        span_ray = float(np.linalg.norm(ends[0, 1] - ends[0, 0]))
+        pixels = float(setup.lens.focal_px.mean()) * span_ray / span_m
+        self._finder = TargetFinder(luma, ends.reshape(-1, 2), setup.lens, Scale(span_ray / span_m, pixels))
+        self.reference_raw = np.stack([self._edges(luma, np.eye(3), Apparent.none(), i) for i in range(len(bands))])
+        found = np.isfinite(self.reference_raw).all(axis=(2, 3)).sum(axis=1)
+        for line, count in zip(LINE_NAMES, found, strict=True):
+            if count < LEAST_STATIONS:
+                raise InputError(
+                    f"project.json: targets.{name}.lines.{line} holds no line with two edges in the reference frame; "
+                    "draw the band along a strip or joint that stands out from the roof"
+                )
+        rays = setup.lens.rays_from_raw(self.reference_raw.mean(axis=2))
+        lines = [fit_line(points, np.ones(len(points)), self._centre) for points in rays]
+        self._lines = LineSet(np.array([n for n, _ in lines]), np.array([o for _, o in lines]), self._centre)
+
+    def find(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None) -> tuple[Floats, Apparent | None]:
+        """Return edges (3, STATIONS, 2, 2) in raw pixels and the apparent motion they show."""
+        if predicted is not None:
+            edges, apparent = self._measure(luma, H_ray_ray0, predicted)
+            if apparent is not None:
+                return edges, apparent
+        seen = self._finder.search(luma, H_ray_ray0)
+        if seen is None:
+            return np.full_like(self.reference_raw, np.nan), None
+        return self._measure(luma, H_ray_ray0, Apparent(seen, predicted.rotation_rad if predicted else 0.0))
+
+    def _measure(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent) -> tuple[Floats, Apparent | None]:
+        edges = np.stack([self._edges(luma, H_ray_ray0, predicted, i) for i in range(len(self._grids))])
+        enough = np.isfinite(edges).all(axis=(2, 3)).sum(axis=1) >= LEAST_STATIONS
+        edges[~enough] = np.nan
+        rays0 = apply_homography(np.linalg.inv(H_ray_ray0), self._lens.rays_from_raw(edges.mean(axis=2)))
+        fit = rigid_from_lines(rays0[None], np.ones((1, *rays0.shape[:2])), self._lines)
+        if not is_determined(fit.normal)[0]:
+            return edges, None
+        return edges, Apparent(fit.shift[0], float(fit.rotation_rad[0]))
+
+    def _edges(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent, number: int) -> Floats:
+        moved = predicted.apply(self._grids[number], self._centre)
+        raw = self._lens.raw_from_rays(apply_homography(H_ray_ray0, moved))
+        maps = np.nan_to_num(raw, nan=-1e4).astype(np.float32)
+        band = cv2.remap(luma, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        pairs = canny_pairs(np.asarray(band, dtype=np.uint8))
+        return _raw_of_rows(pairs, raw)
+
+
+def _lines_target(luma: Luma, target: Target, setup: MeasureSetup) -> CannyLines:
+    if target.lines is None or target.kind != "lines":
+        raise InputError(
+            f'project.json: targets.{target.name} is of kind "points", which method "paper" does not know; '
+            'choose "geometric", or mark lines'
+        )
+    return CannyLines(luma, [getattr(target.lines, name) for name in LINE_NAMES], setup, target.name)
+
+
+def _band_grid(band: Band, setup: MeasureSetup) -> Floats:
+    """Return the rays (rows, STATIONS, 2) of a band's samples on the orthorectified reference frame."""
+    start, end = np.array(band.from_m), np.array(band.to_m)
+    along = end - start
+    across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+    rays = setup.rays_from_plan(np.stack([start, start + across * 0.01]))
+    per_m = float(np.linalg.norm(rays[1] - rays[0])) / 0.01 * float(setup.lens.focal_px.mean())
+    rows = max(16, round(band.width_m * per_m))
+    s = (np.arange(rows) - (rows - 1) / 2) / per_m
+    t = (np.arange(STATIONS) + 0.5) / STATIONS
+    plan = start + t[None, :, None] * along + s[:, None, None] * across
+    return setup.rays_from_plan(plan.reshape(-1, 2)).reshape(plan.shape)
+
+
+def canny_pairs(band: NDArray[np.uint8]) -> Floats:
+    """Return, for each column of an orthorectified band, the rows (columns, 2) of the edge pair nearest its middle.
+
+    Each of Canny's edge pixels is refined to the vertex of the gradient across the line; nan where a column shows no
+    two opposite edges.
+
+    Source: Canny (1986); Devernay (1995) for the vertex.
+    """
+    smooth = cv2.GaussianBlur(band, (0, 0), 1.0)
+    edges = cv2.Canny(smooth, CANNY_LOW, CANNY_HIGH, L2gradient=True) > 0
+    gradient = cv2.Sobel(smooth, cv2.CV_64F, 0, 1, ksize=3)
+    rows, columns = band.shape
+    found = np.full((columns, 2), np.nan)
+    typical = _pair_of(np.abs(np.where(edges, gradient, 0.0)).mean(axis=1), np.where(edges, gradient, 0.0).mean(axis=1))
+    if typical is None:
+        return found
+    number = np.arange(rows)[:, None]
+    for side, place in enumerate(typical):
+        sign = np.sign(np.where(edges, gradient, 0.0).mean(axis=1)[round(place)])
+        near = edges & (np.abs(number - place) <= max(2.0, 0.35 * (typical[1] - typical[0]))) & (gradient * sign > 0)
+        row = np.where(near, np.abs(number - place), np.inf).argmin(axis=0)
+        seen = near.any(axis=0) & (row > 0) & (row < rows - 1)
+        column = np.flatnonzero(seen)
+        r = row[column]
+        size = np.abs(gradient)
+        before, at, after = size[r - 1, column], size[r, column], size[r + 1, column]
+        curvature = before - 2 * at + after
+        shift = np.where(curvature < 0, 0.5 * (before - after) / np.where(curvature < 0, curvature, -1.0), 0.0)
+        found[column, side] = r + np.clip(shift, -1.0, 1.0)
+    found[~np.isfinite(found).all(axis=1)] = np.nan
+    return found
+
+
+def _pair_of(strength: Floats, signed: Floats) -> tuple[float, float] | None:
+    """Return the rows of the two opposite edges that run along the whole band, nearest its middle."""
+    rows = len(strength)
+    pooled = np.convolve(signed, np.ones(3), mode="same")
+    peaks = [
+        r
+        for r in range(1, rows - 1)
+        if abs(pooled[r]) >= abs(pooled[r - 1]) and abs(pooled[r]) > abs(pooled[r + 1]) and abs(pooled[r]) > 8.0
+    ]
+    middle, best, score = (rows - 1) / 2, None, 0.0
+    for number, first in enumerate(peaks):
+        for second in peaks[number + 1 :]:
+            if pooled[first] * pooled[second] >= 0 or not 2 <= second - first <= 0.4 * rows:
+                continue
+            offset = ((first + second) / 2 - middle) / (0.22 * rows)
+            value = min(abs(pooled[first]), abs(pooled[second])) * np.exp(-0.5 * offset**2)
+            value /= 1.0 + ((second - first) / (0.3 * rows)) ** 2
+            if value > score:
+                best, score = (float(first), float(second)), value
+    return best
+
+
+def _raw_of_rows(pairs: Floats, raw: Floats) -> Floats:
+    """Return raw pixels (columns, 2, 2) of sub-pixel rows (columns, 2) of a band whose samples lie at `raw`."""
+    rows = raw.shape[0]
+    low = np.clip(np.floor(np.nan_to_num(pairs)).astype(int), 0, rows - 2)
+    part = (pairs - low)[..., None]
+    column = np.arange(len(pairs))[:, None]
+    return np.asarray(raw[low, column] * (1 - part) + raw[low + 1, column] * part)

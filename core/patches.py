@@ -1,0 +1,174 @@
+"""Reference patches found again in later frames, to a hundredth of a pixel.
+
+Every patch is matched against the *reference* frame, never against the frame before, so errors cannot pile up. The
+patch's predicted affine deformation (from the pose or homography) is applied to the reference, which is kept
+oversampled; the later frame's pixels are used as they are. So the noisy side is never interpolated, which keeps the
+estimate free of the half-pixel pull of an interpolated noise floor (Schreier & Sutton 2002), and light may change by a
+gain and an offset.
+
+Source: Lucas & Kanade (1981); Baker & Matthews (2004) for the forward-additive form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.coordinates import Floats
+from core.video import Luma
+
+Singles = NDArray[np.float32]
+
+HALF_PX = 10  # patches of 21 x 21 pixels: 400 of them are 0.18 megapixel
+MARGIN_PX = 6  # room for deformation and for the interpolation kernel
+OVERSAMPLING = 3  # linear interpolation between thirds of a pixel errs below the noise of 8-bit video
+MAX_ITERATIONS = 8
+CONVERGED_PX = 2e-3
+# A patch that wanders further than this from its prediction has lost its own minimum.
+MAX_WANDER_PX = 5.0
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Where N reference patches were found in a frame.
+
+    Attributes:
+        raw: (N, 2) raw pixels, nan where not found.
+        score: (N,) zero-mean normalised cross-correlation, nan where not found.
+    """
+
+    raw: Floats
+    score: Floats
+
+
+class PatchTracker:
+    """N square patches of the reference frame, ready to be found in other frames.
+
+    Args:
+        luma: the reference frame, (height, width).
+        points_raw: (N, 2) patch centres; at least `HALF_PX + MARGIN_PX + 1` pixels inside the frame.
+    """
+
+    def __init__(self, luma: Luma, points_raw: Floats) -> None:
+        self.points_raw = np.array(points_raw, dtype=np.float64).reshape(-1, 2)
+        self._anchor = np.rint(self.points_raw).astype(np.int64)
+        self._mosaic, self._tile_origin = _oversampled_tiles(luma, self._anchor)
+        side = np.arange(-HALF_PX - 1, HALF_PX + 2, dtype=np.float64)
+        u, v = np.meshgrid(side, side)
+        self._grid = np.stack([u.ravel(), v.ravel(), np.ones(u.size)]).astype(np.float32)
+
+    def __len__(self) -> int:
+        return len(self.points_raw)
+
+    def track(self, luma: Luma, predicted_raw: Floats, ref_from_current: Floats) -> Matches:
+        """Find the patches in a frame.
+
+        Args:
+            luma: the frame, (height, width).
+            predicted_raw: (N, 2) where they should be; a pixel or two of error is corrected.
+            ref_from_current: (N, 2, 2) local affine deformation, reference pixels by frame pixels.
+        """
+        raw, score = np.full((len(self), 2), np.nan), np.full(len(self), np.nan)
+        corner = np.rint(np.where(np.isfinite(predicted_raw), predicted_raw, -1e6)).astype(np.int64) - HALF_PX
+        size = 2 * HALF_PX + 1
+        inside = ((corner >= 0) & (corner + size <= np.array(luma.shape[::-1]))).all(axis=1)
+        index = np.flatnonzero(inside)
+        if not len(index):
+            return Matches(raw, score)
+        pixels = _cut_out(luma, corner[index], size)
+        found, score[index] = self._align(index, pixels, predicted_raw[index], ref_from_current[index])
+        wandered = np.abs(found - predicted_raw[index]).max(axis=1) > MAX_WANDER_PX
+        found[wandered], score[index[wandered]] = np.nan, np.nan
+        raw[index] = found
+        return Matches(raw, score)
+
+    def _align(
+        self, index: NDArray[np.int64], pixels: Singles, predicted_raw: Floats, ref_from_current: Floats
+    ) -> tuple[Floats, Floats]:
+        centre = np.rint(predicted_raw)
+        position = predicted_raw.copy()
+        values = pixels - pixels.mean(axis=(1, 2), keepdims=True)
+        energy = np.einsum("nij,nij->n", values, values)
+        score = np.zeros(len(index))
+        active = np.arange(len(index))
+        for _ in range(MAX_ITERATIONS):
+            template = self._template(index[active], (centre - position)[active], ref_from_current[active])
+            step, score[active] = _step(values[active], energy[active], template)
+            position[active] += step
+            moving = (np.abs(step).max(axis=1) > CONVERGED_PX) & (
+                np.abs(position - predicted_raw)[active].max(axis=1) < 2 * MAX_WANDER_PX
+            )
+            active = active[moving]
+            if not len(active):
+                break
+        return position, score
+
+    def _template(self, index: NDArray[np.int64], offset: Floats, ref_from_current: Floats) -> Singles:
+        """Return the reference as the frame should show it, (n, size + 2, size + 2), around the frame's pixels."""
+        # A frame pixel at centre + x shows the reference at point + A (centre + x - position).
+        start = np.einsum("nij,nj->ni", ref_from_current, offset) + self.points_raw[index] - self._anchor[index]
+        coefficients = np.concatenate([ref_from_current, start[..., None]], axis=2)
+        coefficients *= OVERSAMPLING
+        coefficients[..., 2] += self._tile_origin[index]
+        maps = coefficients.astype(np.float32) @ self._grid
+        side = 2 * HALF_PX + 3
+        sampled = cv2.remap(self._mosaic, maps[:, 0], maps[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(sampled, dtype=np.float32).reshape(len(index), side, side)
+
+
+def _oversampled_tiles(luma: Luma, anchor: NDArray[np.int64]) -> tuple[Singles, Floats]:
+    """Return one mosaic of oversampled patches and the mosaic coordinates (N, 2) of each patch's centre."""
+    size = 2 * (HALF_PX + MARGIN_PX) + 1
+    tile = size * OVERSAMPLING
+    columns = max(1, int(np.ceil(np.sqrt(len(anchor)))))
+    rows = max(1, -(-len(anchor) // columns))
+    mosaic = np.zeros((rows * tile, columns * tile), dtype=np.float32)
+    origin = np.empty((len(anchor), 2))
+    for number, patch in enumerate(_cut_out(luma, anchor - HALF_PX - MARGIN_PX, size)):
+        top, left = (number // columns) * tile, (number % columns) * tile
+        large = cv2.resize(patch, (tile, tile), interpolation=cv2.INTER_LANCZOS4)
+        mosaic[top : top + tile, left : left + tile] = large
+        # Pixel centres: enlarged index = OVERSAMPLING * (index + 1/2) - 1/2.
+        centre = OVERSAMPLING * (HALF_PX + MARGIN_PX + 0.5) - 0.5
+        origin[number] = left + centre, top + centre
+    return mosaic, origin
+
+
+def _cut_out(luma: Luma, corner: NDArray[np.int64], size: int) -> Singles:
+    patches = np.empty((len(corner), size, size), dtype=np.float32)
+    for number, (left, top) in enumerate(corner.tolist()):
+        patches[number] = luma[top : top + size, left : left + size]
+    return patches
+
+
+def _step(values: Singles, energy: Singles, template: Singles) -> tuple[Floats, Floats]:
+    """Return one Gauss-Newton step (n, 2) in pixels and the correlation (n,) before it."""
+    model = template[:, 1:-1, 1:-1]
+    model = model - model.mean(axis=(1, 2), keepdims=True)
+    gu = (template[:, 1:-1, 2:] - template[:, 1:-1, :-2]) * np.float32(0.5)
+    gv = (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]) * np.float32(0.5)
+    n = len(values)
+    # One small Gram matrix per patch holds every product that is needed.
+    basis = np.stack([model.reshape(n, -1), gu.reshape(n, -1), gv.reshape(n, -1)], axis=1)
+    ones = basis.mean(axis=2)
+    pixels = values.shape[1] * values.shape[2]
+    gram = (basis @ basis.transpose(0, 2, 1) - pixels * ones[:, :, None] * ones[:, None, :]).astype(np.float64)
+    moment = (basis @ values.reshape(n, -1, 1))[..., 0].astype(np.float64)
+    power = np.maximum(gram[:, 0, 0], 1e-9)
+    gain = moment[:, 0] / power
+    score = moment[:, 0] / np.sqrt(power * np.maximum(energy, 1e-9))
+    # Project the gain out of the gradients (variable projection), then solve the 2 x 2 system.
+    across = gram[:, 0, 1:] / power[:, None]
+    H = gram[:, 1:, 1:] - across[:, :, None] * gram[:, 0, None, 1:]
+    b = moment[:, 1:] - across * moment[:, :1]
+    determinant = H[:, 0, 0] * H[:, 1, 1] - H[:, 0, 1] ** 2
+    usable = (determinant > 1e-6 * (H[:, 0, 0] + H[:, 1, 1]) ** 2) & (gain > 0.1)
+    safe = np.where(usable, determinant * gain, 1.0)
+    du = (H[:, 1, 1] * b[:, 0] - H[:, 0, 1] * b[:, 1]) / safe
+    dv = (H[:, 0, 0] * b[:, 1] - H[:, 0, 1] * b[:, 0]) / safe
+    step = -np.stack([du, dv], axis=1)
+    step = np.where(usable[:, None], np.clip(step, -2.0, 2.0), 0.0)
+    return step, np.where(usable, score, 0.0)

@@ -1,0 +1,104 @@
+"""What the pass over the video is told, and how it guesses where to look in the next frame."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from core.coordinates import Floats, apply_homography
+from core.errors import InputError
+from core.following import Apparent
+from core.lens import Lens
+from core.measurements import FrameMeasurement, Reference
+from core.project import Method, Target
+
+# Raised whenever the same video would be measured differently: older recordings are then not continued.
+MEASURE_VERSION = 1
+# Bytes read at each of a video's places to tell it from another.
+SAMPLE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class MeasureSetup:
+    """Everything the pass over a video needs; can be sent to another process or machine.
+
+    Attributes:
+        H_ray_plan: (3, 3) from local plan metres to rays of the reference frame: where to look.
+        origin_m: (2,) of the local plan.
+    """
+
+    video: Path
+    reference_frame: int
+    moving_regions_px: tuple[tuple[tuple[float, float], ...], ...]
+    targets: tuple[Target, ...]
+    method: Method
+    lens: Lens
+    H_ray_plan: Floats
+    origin_m: Floats
+
+    def rays_from_plan(self, plan_m: Floats) -> Floats:
+        """Return rays (N, 2) of the reference frame at absolute plan metres (N, 2)."""
+        return apply_homography(self.H_ray_plan, np.asarray(plan_m) - self.origin_m)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Names what is measured: equal fingerprints, equal measurements, whatever the geometry."""
+        looked_for = [
+            target.model_dump(mode="json", include={"name", "kind", "lines", "region_m"}) for target in self.targets
+        ]
+        decided = [MEASURE_VERSION, self.method, self.reference_frame, self.moving_regions_px, looked_for]
+        digest = hashlib.sha256(json.dumps(decided, sort_keys=True).encode())
+        digest.update(video_identity(self.video).encode())
+        return digest.hexdigest()
+
+
+def video_identity(video: Path) -> str:
+    """Return a name for a video's content from its size and samples of its bytes; quick for any size."""
+    try:
+        size = video.stat().st_size
+        digest = hashlib.sha256(str(size).encode())
+        with video.open("rb") as stream:
+            for place in sorted({0, max(0, size // 2), max(0, size - SAMPLE_BYTES)}):
+                stream.seek(place)
+                digest.update(stream.read(SAMPLE_BYTES))
+    except OSError:
+        raise InputError(f"{video}: not found; correct inputs.video or put the file there.") from None
+    return digest.hexdigest()
+
+
+def nothing_measured(reference: Reference, frame: int, time_s: float) -> FrameMeasurement:
+    """Return the record of a frame in which the ground was not recognised."""
+    return FrameMeasurement(
+        frame,
+        time_s,
+        np.full((3, 3), np.nan),
+        np.full_like(reference.ground_raw, np.nan),
+        {name: np.full_like(raw, np.nan) for name, raw in reference.targets_raw.items()},
+        dict.fromkeys(reference.targets_raw),
+    )
+
+
+def predict_homography(before: Sequence[FrameMeasurement]) -> Floats | None:
+    """Return the camera's homography if it goes on turning and drifting as in the last two frames."""
+    if not before or not np.isfinite(before[-1].H_ray_ray0).all():
+        return None
+    last = before[-1].H_ray_ray0
+    if len(before) < 2 or not np.isfinite(before[-2].H_ray_ray0).all():
+        return last
+    return np.asarray(last @ np.linalg.inv(before[-2].H_ray_ray0) @ last)
+
+
+def predict_apparent(before: Sequence[FrameMeasurement], name: str, time_s: float) -> Apparent | None:
+    """Return a target's apparent motion at a time if it goes on as in the last two frames."""
+    if not before or (last := before[-1].apparent[name]) is None:
+        return None
+    if len(before) < 2 or (earlier := before[-2].apparent[name]) is None:
+        return last
+    step_s = before[-1].time_s - before[-2].time_s
+    return last.towards(earlier, (time_s - before[-1].time_s) / step_s if step_s > 0 else 1.0)

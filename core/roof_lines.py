@@ -1,0 +1,354 @@
+"""Roof lines measured in the frame's own pixels: search band -> both edges of the strip -> mid-line points.
+
+A strip runs mostly along image rows or mostly along columns. Its cross profiles are taken along the other axis, so
+every sample is a pixel as the camera delivered it: nothing is warped and nothing interpolated. Columns are pooled into
+stations that stay on the same piece of roof in every frame.
+
+The mid-line of two opposite edges does not move when blur or exposure change; a single edge does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.coordinates import Floats
+from core.errors import InputError
+from core.video import Luma
+
+Singles = NDArray[np.float32]
+# A function that leads from the band's own coordinates to raw pixels of a frame: (N, 2) -> (N, 2).
+Mapping = Callable[[Floats], Floats]
+
+STATIONS = 64
+# Least strength of an edge, grey levels per pixel, below which noise decides where it is.
+LEAST_EDGE = 1.5
+# Correlation of the cross profile below which something else lies in the band.
+LEAST_CORRELATION = 0.5
+NEWTON_STEPS = 4
+
+
+@dataclass(frozen=True)
+class StripProfile:
+    """What a strip looks like in the reference frame, across itself, in raw pixels.
+
+    Attributes:
+        offset_px, tilt_px: of the strip's mid-line from the band's axis: offset + tilt * x, x from -1 to 1.
+        width_px: between its two edges.
+        polarity: +1 for a strip brighter than its surroundings, -1 for a darker one.
+        edge: mean strength of its edges, grey levels per pixel.
+        signature: (m,) mean cross profile around the mid-line, zero mean, unit norm.
+    """
+
+    offset_px: float
+    tilt_px: float
+    width_px: float
+    polarity: float
+    edge: float
+    signature: Singles
+
+
+@dataclass(frozen=True)
+class LineMatch:
+    """One roof line in one frame.
+
+    Attributes:
+        edges_raw: (STATIONS, 2, 2) the two edges at each station, raw pixels u, v; nan where not measured.
+        correlation: of the cross profile with the reference's.
+    """
+
+    edges_raw: Floats
+    correlation: float
+
+    @property
+    def midline_raw(self) -> Floats:
+        """(STATIONS, 2) raw pixels."""
+        return np.asarray(self.edges_raw.mean(axis=1))
+
+    @property
+    def measured(self) -> int:
+        """Number of stations at which both edges were found."""
+        return int(np.isfinite(self.edges_raw).all(axis=(1, 2)).sum())
+
+
+NOT_FOUND = LineMatch(edges_raw=np.full((STATIONS, 2, 2), np.nan), correlation=0.0)
+
+
+@dataclass(frozen=True)
+class _Section:
+    """Cross profiles of a band in one frame.
+
+    Attributes:
+        along, across: (n,) positions of the profiles' middles: whole pixels along, predicted line across.
+        values: (n, 2 w + 1) grey levels around `rint(across)`.
+        place: (n,) from 0 to 1 along the band.
+        axis: 0 if the line runs along u, 1 if along v.
+    """
+
+    along: Floats
+    across: Floats
+    values: Singles
+    place: Floats
+    axis: int
+
+    @property
+    def half(self) -> int:
+        """Pixels on either side of the middle."""
+        return (self.values.shape[1] - 1) // 2
+
+    @property
+    def x(self) -> Floats:
+        """(n,) from -1 to 1 along the band."""
+        return 2.0 * self.place - 1.0
+
+
+class LineTracker:
+    """Follows one strip.
+
+    Args:
+        luma: the reference frame.
+        ends: (2, 2) the band's axis in any frame that `mapping` leads from.
+        to_raw: mapping of that frame to the reference frame's raw pixels.
+        width_px: full width of the search band, raw pixels.
+        name: for messages.
+
+    Raises:
+        InputError: the band leaves the frame or holds no strip.
+    """
+
+    def __init__(self, luma: Luma, ends: Floats, to_raw: Mapping, *, width_px: float, name: str) -> None:
+        self._axis_points = ends[0] + np.linspace(0.0, 1.0, 33)[:, None] * (ends[1] - ends[0])
+        # Kept for good: near 45 degrees the axis must not change from one frame to the next.
+        span = np.abs(np.subtract(*to_raw(ends)))
+        self._axis = 0 if span[0] >= span[1] else 1
+        self._half_band = max(6, int(np.ceil(width_px / 2)))
+        section = self._section(luma, to_raw, self._half_band + 4)
+        if section is None:
+            raise InputError(f"{name} lies outside the reference frame; move it onto the roof")
+        self.profile = _find_strip(section, self._half_band, name)
+        context = (len(self.profile.signature) - 1) // 2
+        self._reach = self._half_band + context + int(np.ceil(abs(self.profile.tilt_px))) + 1
+
+    @property
+    def station_place(self) -> Floats:
+        """(STATIONS,) of the stations' middles along the band, from 0 to 1."""
+        return (np.arange(STATIONS) + 0.5) / STATIONS
+
+    def find(self, luma: Luma, to_raw: Mapping, *, search_px: float | None = None) -> LineMatch:
+        """Return the line in a frame.
+
+        Args:
+            luma: the frame.
+            to_raw: where the band should lie, as predicted.
+            search_px: how far the prediction may be wrong; None for half the band's width.
+        """
+        section = self._section(luma, to_raw, self._reach)
+        if section is None:
+            return NOT_FOUND
+        search = min(self._half_band, int(np.ceil(search_px if search_px is not None else self._half_band)))
+        offset, correlation = self._locate(section, search)
+        if correlation < LEAST_CORRELATION:
+            return LineMatch(edges_raw=NOT_FOUND.edges_raw, correlation=correlation)
+        return LineMatch(edges_raw=self._edges(section, offset), correlation=correlation)
+
+    def _section(self, luma: Luma, to_raw: Mapping, half: int) -> _Section | None:
+        """Cut the band out of a frame, or None where it leaves the frame almost everywhere."""
+        raw = to_raw(self._axis_points)
+        if not np.isfinite(raw).all():
+            return None
+        axis = self._axis
+        order = 1 if raw[-1, axis] > raw[0, axis] else -1
+        path = raw[::order]
+        length, breadth = (luma.shape[1], luma.shape[0]) if axis == 0 else luma.shape
+        first, last = int(np.ceil(path[0, axis])), int(np.floor(path[-1, axis]))
+        along = np.arange(max(first, 0), min(last, length - 1) + 1, dtype=np.float64)
+        if len(along) < STATIONS // 2:
+            return None
+        across = np.interp(along, path[:, axis], path[:, 1 - axis])
+        place = np.interp(along, path[:, axis], np.linspace(0.0, 1.0, len(path))[::order])
+        middle = np.rint(across).astype(np.int64)
+        inside = (middle >= half) & (middle < breadth - half)
+        if inside.sum() < STATIONS // 2:
+            return None
+        along, across, place, middle = along[inside], across[inside], place[inside], middle[inside]
+        return _Section(along, across, _profiles(luma, along, middle, half, axis), place, axis)
+
+    def _locate(self, section: _Section, search: int) -> tuple[float, float]:
+        """Return the strip's offset from its expected place, whole pixels, and its correlation there."""
+        expected = self.profile.offset_px + self.profile.tilt_px * section.x
+        fraction = section.across + expected - np.rint(section.across)
+        signature = self.profile.signature
+        context = (len(signature) - 1) // 2
+        scores = []
+        for part in np.array_split(np.arange(len(section.along)), 4):
+            base = int(np.rint(fraction[part].mean()))
+            window = section.values[part].mean(axis=0)
+            first = section.half + base - search - context
+            last = section.half + base + search + context + 1
+            if first < 0 or last > len(window):
+                padded = np.pad(window, len(window), mode="edge")
+                first, last, window = first + len(window), last + len(window), padded
+            scores.append(_correlations(window[first:last], signature))
+        score = np.median(np.stack(scores), axis=0)
+        shifts = np.arange(-search, search + 1)
+        # Among equals the nearest wins; a look-alike must be clearly better to be preferred.
+        best = int(np.argmax(score - 0.1 * (shifts / max(search, 1)) ** 2))
+        return float(shifts[best]), float(score[best])
+
+    def _edges(self, section: _Section, offset: float) -> Floats:
+        """Return both edges (STATIONS, 2, 2) by Newton's method on the response to a derivative of a Gaussian."""
+        bin_of = np.minimum((section.place * STATIONS).astype(np.int64), STATIONS - 1)
+        line = section.across + self.profile.offset_px + self.profile.tilt_px * section.x + offset
+        count = np.bincount(bin_of, minlength=STATIONS).astype(np.float64)
+        filled = np.maximum(count, 1.0)
+        along = np.bincount(bin_of, section.along, STATIONS) / filled
+        middle = np.bincount(bin_of, line, STATIONS) / filled
+        wanted = 0.5 * np.median(count[count > 0])
+        found = np.full((STATIONS, 2, 2), np.nan)
+        for side, sign in enumerate((-1.0, 1.0)):
+            edge = line + sign * self.profile.width_px / 2
+            slope_sign = -sign * self.profile.polarity
+            shift, strength = _newton(section, edge, bin_of, slope_sign, self._scale_px())
+            good = (count >= wanted) & (np.abs(shift) < self._capture_px()) & (strength > 0.25 * self.profile.edge)
+            position = middle + sign * self.profile.width_px / 2 + shift
+            found[good, side, section.axis] = along[good]
+            found[good, side, 1 - section.axis] = position[good]
+        width = found[:, 1, 1 - section.axis] - found[:, 0, 1 - section.axis]
+        wrong = ~(np.abs(width - self.profile.width_px) < 0.3 * self.profile.width_px + 0.7)
+        found[wrong] = np.nan
+        return found
+
+    def _scale_px(self) -> float:
+        """Width of the Gaussian whose derivative finds an edge: near a sharp picture's blur, under half the strip."""
+        return float(np.clip(self.profile.width_px / 5.0, 0.8, 1.5))
+
+    def _capture_px(self) -> float:
+        return min(3.0, 0.6 * self.profile.width_px)
+
+
+def _profiles(luma: Luma, along: Floats, middle: NDArray[np.int64], half: int, axis: int) -> Singles:
+    """Return pixels (n, 2 half + 1) across the line, as they are."""
+    first, last = int(along[0]), int(along[-1]) + 1
+    low, high = int(middle.min()) - half, int(middle.max()) + half + 1
+    block = luma[low:high, first:last].T if axis == 0 else luma[first:last, low:high]
+    block = np.ascontiguousarray(block)
+    start = (along.astype(np.int64) - first) * block.shape[1] + middle - half - low
+    return block.ravel().take(start[:, None] + np.arange(2 * half + 1)).astype(np.float32)
+
+
+def _correlations(window: Singles, signature: Singles) -> Floats:
+    """Return the normalised correlation of a signature (m,) at every shift in a window (m + shifts - 1,)."""
+    pieces = np.lib.stride_tricks.sliding_window_view(window, len(signature)).astype(np.float64)
+    pieces = pieces - pieces.mean(axis=1, keepdims=True)
+    norm = np.sqrt((pieces**2).sum(axis=1))
+    return np.asarray((pieces @ signature) / np.maximum(norm, 1e-6 + 0.5 * np.sqrt(len(signature))))
+
+
+def _newton(
+    section: _Section, edge: Floats, bin_of: NDArray[np.int64], slope_sign: float, scale_px: float
+) -> tuple[Floats, Floats]:
+    """Return, per station, how far the true edge lies from `edge` (n,) and its strength in grey levels per pixel.
+
+    All columns of a station share one shift; it makes their summed response to a derivative of a Gaussian extreme.
+    """
+    half = int(np.ceil(3.0 * scale_px)) + 1
+    taps = np.arange(-half, half + 1)
+    shift = np.zeros(STATIONS)
+    strength = np.zeros(STATIONS)
+    origin = np.rint(section.across) - section.half
+    rows = np.arange(len(edge))[:, None]
+    last = section.values.shape[1] - 1
+    for _ in range(NEWTON_STEPS):
+        position = edge + shift[bin_of] - origin
+        nearest = np.rint(position)
+        index = np.clip(nearest[:, None].astype(np.int64) + taps, 0, last)
+        sample = section.values[rows, index]
+        s = (nearest - position)[:, None] + taps
+        gauss = np.exp(-0.5 * (s / scale_px) ** 2)
+        # Derivatives of the response sum f(s) s exp(-s^2 / 2 sigma^2) by the position of the kernel.
+        q = (s / scale_px) ** 2
+        first = np.bincount(bin_of, ((q - 1.0) * gauss * sample).sum(axis=1), STATIONS)
+        second = np.bincount(bin_of, ((q - 3.0) * s / scale_px**2 * gauss * sample).sum(axis=1), STATIONS)
+        response = np.bincount(bin_of, (s * gauss * sample).sum(axis=1), STATIONS)
+        power = np.bincount(bin_of, (s * s * gauss).sum(axis=1), STATIONS)
+        strength = slope_sign * response / np.maximum(power, 1e-9)
+        curved = second * slope_sign < 0
+        step = np.where(curved, -first / np.where(curved, second, 1.0), 0.0)
+        shift += np.clip(step, -1.0, 1.0)
+    return shift, np.where(curved & (np.abs(step) < 0.05), strength, 0.0)
+
+
+def _find_strip(section: _Section, half_band: int, name: str) -> StripProfile:
+    """Find the strip of a band in the reference frame: two opposite edges, near the axis, along the whole band.
+
+    Raises:
+        InputError: there is none.
+    """
+    best: tuple[float, float, float, float, float, float] | None = None
+    for tilt in np.linspace(-4.0, 4.0, 17):
+        profile = _mean_profile(section, 0.0, tilt)
+        for score, middle, width, polarity, edge in _edge_pairs(profile, half_band):
+            if best is None or score > best[0]:
+                best = (score, middle, tilt, width, polarity, edge)
+    if best is None:
+        raise InputError(
+            f"{name} holds no line with two edges in the reference frame; draw the band along a strip or joint, "
+            "a few pixels wide, that stands out from the roof"
+        )
+    _, offset, tilt, width, polarity, edge = best
+    context = round(1.2 * width + 4)
+    signature = _mean_profile(section, offset, tilt)
+    middle_index = (len(signature) - 1) // 2
+    context = min(context, middle_index)
+    signature = signature[middle_index - context : middle_index + context + 1]
+    signature = signature - signature.mean()
+    unit = (signature / np.linalg.norm(signature)).astype(np.float32)
+    return StripProfile(offset, tilt, width, polarity, edge, unit)
+
+
+def _mean_profile(section: _Section, offset: float, tilt: float) -> Singles:
+    """Return the mean cross profile along the band sheared by offset + tilt x, linearly interpolated, odd length."""
+    position = section.across - np.rint(section.across) + offset + tilt * section.x + section.half
+    half = section.half - int(np.ceil(abs(offset) + abs(tilt))) - 1
+    s = position[:, None] + np.arange(-half, half + 1)
+    low = np.clip(np.floor(s).astype(np.int64), 0, section.values.shape[1] - 2)
+    part = (s - low).astype(np.float32)
+    rows = np.arange(len(position))[:, None]
+    values = section.values[rows, low] * (1 - part) + section.values[rows, low + 1] * part
+    return np.asarray(np.median(values.reshape(len(values), -1), axis=0) * 0.5 + values.mean(axis=0) * 0.5)
+
+
+def _edge_pairs(profile: Singles, half_band: int) -> list[tuple[float, float, float, float, float]]:
+    """Return candidate strips of a mean profile: (score, middle, width, polarity, edge strength)."""
+    gradient = np.gradient(profile.astype(np.float64))
+    middle_index = (len(profile) - 1) / 2
+    peaks = [
+        i
+        for i in range(1, len(gradient) - 1)
+        if abs(gradient[i]) >= LEAST_EDGE
+        and abs(gradient[i]) >= abs(gradient[i - 1])
+        and abs(gradient[i]) > abs(gradient[i + 1])
+    ]
+    refined = [(_vertex(np.abs(gradient), i), gradient[i]) for i in peaks]
+    widest = max(8.0, half_band * 0.9)
+    found = []
+    for number, (left, rise) in enumerate(refined):
+        for right, fall in refined[number + 1 :]:
+            width, middle = right - left, (left + right) / 2 - middle_index
+            if rise * fall >= 0 or not 1.5 <= width <= widest or abs(middle) > half_band:
+                continue
+            strength = min(abs(rise), abs(fall))
+            # A person draws the band around the line: what lies near its axis is meant.
+            nearness = np.exp(-0.5 * (middle / (0.45 * half_band)) ** 2)
+            # Of nested pairs the narrow one is the strip; the wide one spans two strips.
+            slenderness = 1.0 / (1.0 + (width / (0.6 * half_band)) ** 2)
+            found.append((strength * nearness * slenderness, middle, width, float(np.sign(rise)), strength))
+    return found
+
+
+def _vertex(values: Floats, i: int) -> float:
+    curvature = values[i - 1] - 2 * values[i] + values[i + 1]
+    return float(i) if curvature == 0 else i + 0.5 * (values[i - 1] - values[i + 1]) / curvature

@@ -1,0 +1,330 @@
+"""One project folder from inputs to results: what `rooftrack run` and the browser interface both call."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from core.cloud import Cloud, GroundPlane, fit_ground_plane, read_cloud
+from core.coordinates import Floats, invert_homography
+from core.errors import InputError
+from core.export import Results, write_results
+from core.georeference import ReferenceFit
+from core.intervals import within
+from core.lens import Lens, read_lens, require_image_size
+from core.measure import measure
+from core.measurements import MeasurementStore, Recording
+from core.orthoimage import make_orthoimage, write_geotiff
+from core.prediction import MeasureSetup, video_identity
+from core.progress import CancelToken, Progress, silent
+from core.project import Project, read_project, write_atomically
+from core.relief import Relief, rasterise
+from core.solution import Solution
+from core.solve import solve
+from core.solve_geometric import fit_with_relief
+from core.validation import GpsRecord, read_gps
+from core.video import VideoInfo, frame_index, probe
+
+FRAMES_FILE = "frames.sqlite"
+RELIEF_FILE = "relief.npz"
+ORTHOIMAGE_FILE = "orthoimage.tif"
+# How far around the clicks the relief of the ground is kept, metres.
+RELIEF_MARGIN_M = 15.0
+
+
+@dataclass(frozen=True)
+class LoadedInputs:
+    """A project with everything it names, opened and checked against each other.
+
+    Attributes:
+        lens: as calibrated, or an ideal one where none is given.
+        has_lens: whether it is the calibrated one.
+        relief: of the ground, where there is a cloud.
+    """
+
+    folder: Path
+    project: Project
+    video: Path
+    info: VideoInfo
+    lens: Lens
+    has_lens: bool
+    relief: Relief | None
+    gps: GpsRecord | None
+
+    def reference_fit(self) -> ReferenceFit:
+        """Return the fit of the clicks."""
+        return fit_with_relief(self.project, self.lens, self.relief, has_lens=self.has_lens)
+
+    def setup(self) -> MeasureSetup:
+        """Return what the pass over the video needs."""
+        fit = self.reference_fit()
+        return MeasureSetup(
+            video=self.video,
+            reference_frame=self.project.reference_frame,
+            moving_regions_px=self.project.moving_regions_px,
+            targets=self.project.targets,
+            method=self.project.method,
+            lens=self.lens,
+            H_ray_plan=invert_homography(fit.H_plan_ray),
+            origin_m=fit.origin_m,
+        )
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """What a run did, for the terminal."""
+
+    folder: Path
+    frames: int
+    frames_measured: int
+    measuring_s: float
+    solving_s: float
+    summary: Mapping[str, Any]
+
+
+def run_project(
+    folder: Path,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    fresh: bool = False,
+    progress: Progress = silent,
+    cancel: CancelToken | None = None,
+) -> RunSummary:
+    """Measure what is missing, solve, and write all results of a project folder.
+
+    Args:
+        workers: processes that measure side by side.
+        scheduler: address of a Dask scheduler whose workers measure instead.
+        fresh: forget earlier measurements of this method.
+
+    Raises:
+        InputError: with the first thing that keeps the project from being measured; earlier results stay as they were.
+        Cancelled: on request; what was measured stays and the next run goes on from there.
+    """
+    inputs = load_inputs(folder, progress)
+    _require_runnable(inputs)
+    started = time.perf_counter()
+    results = folder / "results"
+    with MeasurementStore(results / FRAMES_FILE) as store:
+        setup = inputs.setup()
+        before = _frames_known(store, setup)
+        recording_id = measure(
+            setup, store, workers=workers, scheduler=scheduler, fresh=fresh, progress=progress, cancel=cancel
+        )
+        recording = store.load(recording_id)
+    measured_s = time.perf_counter() - started
+    progress("solving", 0, 1)
+    solving = time.perf_counter()
+    solution = solve(recording, inputs.project, inputs.lens, inputs.relief, has_lens=inputs.has_lens)
+    solved_s = time.perf_counter() - solving
+    progress("solving", 1, 1)
+    new = len(recording.frame) - (0 if fresh else before)
+    _write_orthoimage(inputs, progress)
+    summary = write_results(
+        results,
+        Results(
+            project=inputs.project,
+            folder=folder,
+            recording=recording,
+            solution=solution,
+            gps=inputs.gps,
+            video=inputs.video,
+            sha256={file: sha256_of(folder / file, results) for file in input_files(inputs.project)},
+            version=program_version(),
+            frames_measured=new,
+            measuring_s=measured_s,
+            solving_s=solved_s,
+        ),
+        progress,
+    )
+    return RunSummary(folder, len(recording.frame), new, measured_s, solved_s, summary)
+
+
+def load_inputs(folder: Path, progress: Progress = silent) -> LoadedInputs:
+    """Open everything a project names.
+
+    Raises:
+        InputError: something is missing, malformed or does not fit together.
+    """
+    project = read_project(folder)
+    video = folder / project.inputs.video
+    info = probe(video)
+    lens = _lens_of(folder, project, info)
+    gps = project.inputs.gps
+    return LoadedInputs(
+        folder=folder,
+        project=project,
+        video=video,
+        info=info,
+        lens=lens or Lens.ideal((info.width, info.height), float(max(info.width, info.height))),
+        has_lens=lens is not None,
+        relief=_relief_of(folder, project, progress),
+        gps=None if gps is None else read_gps(folder / gps.file, gps),
+    )
+
+
+def _lens_of(folder: Path, project: Project, info: VideoInfo) -> Lens | None:
+    if project.inputs.lens is None:
+        return None
+    file = folder / project.inputs.lens
+    lens = read_lens(file)
+    require_image_size(
+        lens, width=info.width, height=info.height, lens_file=file, video_file=folder / project.inputs.video
+    )
+    return lens
+
+
+def _relief_of(folder: Path, project: Project, progress: Progress) -> Relief | None:
+    """Return the ground's relief, from an earlier run where the cloud and what decides the raster are the same."""
+    if project.inputs.cloud is None or not project.correspondences:
+        return None
+    cloud_file = folder / project.inputs.cloud
+    places = np.array([pair.ground_m for pair in project.correspondences])
+    west, south = np.floor(places.min(axis=0) - RELIEF_MARGIN_M)
+    east, north = np.ceil(places.max(axis=0) + RELIEF_MARGIN_M)
+    below = _middle_of_targets(project, places)
+    extent = (float(west), float(south), float(east), float(north))
+    decided = json.dumps([video_identity(cloud_file), extent, below.tolist(), project.orthoimage.ground_z_m])
+    name = hashlib.sha256(decided.encode()).hexdigest()[:16]
+    file = folder / "results" / f"{name}-{RELIEF_FILE}"
+    known = Relief.load(file)
+    if known is not None:
+        return known
+    cloud, plane = read_ground(folder, project, progress)
+    relief = rasterise(cloud, plane, extent, below)
+    for old in file.parent.glob(f"*-{RELIEF_FILE}"):
+        old.unlink()
+    relief.save(file)
+    return relief
+
+
+def read_ground(folder: Path, project: Project, progress: Progress = silent) -> tuple[Cloud, GroundPlane]:
+    """Return the project's cloud and its ground plane.
+
+    Raises:
+        InputError: there is no cloud, or no ground in it.
+    """
+    if project.inputs.cloud is None:
+        raise InputError(f"{folder / 'project.json'}: inputs.cloud is missing; add the LiDAR point cloud.")
+    file = folder / project.inputs.cloud
+    cloud = read_cloud(file, progress)
+    try:
+        return cloud, fit_ground_plane(cloud, project.orthoimage.ground_z_m)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+
+
+def _middle_of_targets(project: Project, otherwise: Floats) -> Floats:
+    """Return the middle (2,) of what is measured, where heights count from the ground.
+
+    To a metre, so that moving a band a little does not make the relief anew.
+    """
+    corners: list[tuple[float, float]] = []
+    for target in project.targets:
+        if target.lines is not None:
+            bands = (target.lines.L1, target.lines.L2, target.lines.T1)
+            corners += [end for band in bands for end in (band.from_m, band.to_m)]
+        corners += list(target.region_m or ())
+    return np.asarray(np.rint((np.array(corners) if corners else otherwise).mean(axis=0)))
+
+
+def _require_runnable(inputs: LoadedInputs) -> None:
+    project, file = inputs.project, inputs.folder / "project.json"
+    if not project.moving_regions_px:
+        raise InputError(f"{file}: moving_regions_px is empty; draw a polygon around the building and all that moves.")
+    if not project.targets:
+        raise InputError(f"{file}: targets is empty; mark a roof with three search bands, or a textured region.")
+    if project.method == "geometric" and not inputs.has_lens:
+        raise InputError(
+            f'{file}: inputs.lens is missing; method "geometric" needs it: calibrate with `rooftrack lens`, or choose '
+            'method "paper".'
+        )
+    frames = len(frame_index(inputs.video))
+    if project.reference_frame >= frames:
+        raise InputError(
+            f"{file}: reference_frame is {project.reference_frame}, the video's last frame is {frames - 1}; lower it."
+        )
+    time_s = frame_index(inputs.video).time_s
+    for name, interval in project.intervals_s:
+        if interval is not None and not within(time_s, interval).any():
+            raise InputError(
+                f"{file}: intervals_s.{name} is {list(interval)}, outside the video, which lasts from 0 to "
+                f"{time_s[-1]:.2f} s; correct it."
+            )
+
+
+def _frames_known(store: MeasurementStore, setup: MeasureSetup) -> int:
+    recording = store.find(setup.method, setup.fingerprint)
+    return 0 if recording is None else len(store.measured_frames(recording))
+
+
+def solve_recorded(inputs: LoadedInputs) -> tuple[Recording, Solution] | None:
+    """Return what an earlier pass over the video measured, solved with the project as it stands now.
+
+    None where nothing has been measured for this method, video, moving regions and bands.
+    """
+    file = inputs.folder / "results" / FRAMES_FILE
+    if not file.exists():
+        return None
+    with MeasurementStore(file) as store:
+        setup = inputs.setup()
+        found = store.find(setup.method, setup.fingerprint)
+        if found is None:
+            return None
+        recording = store.load(found)
+    return recording, solve(recording, inputs.project, inputs.lens, inputs.relief, has_lens=inputs.has_lens)
+
+
+def _write_orthoimage(inputs: LoadedInputs, progress: Progress) -> None:
+    """Write the orthoimage unless the one there was made from the same cloud and settings."""
+    if inputs.project.inputs.cloud is None:
+        return
+    file = inputs.folder / "results" / ORTHOIMAGE_FILE
+    note = file.with_suffix(".made-from")
+    settings = inputs.project.orthoimage.model_dump_json()
+    made_from = f"{video_identity(inputs.folder / inputs.project.inputs.cloud)} {settings}"
+    if file.exists() and note.exists() and note.read_text() == made_from:
+        return
+    cloud, plane = read_ground(inputs.folder, inputs.project, progress)
+    write_geotiff(file, make_orthoimage(cloud, plane, inputs.project.orthoimage, progress))
+    write_atomically(note, made_from.encode())
+
+
+def input_files(project: Project) -> list[str]:
+    """Return the input files of a project as it names them."""
+    inputs = project.inputs
+    files = [inputs.video, inputs.cloud, inputs.lens, inputs.gps.file if inputs.gps else None]
+    return [file for file in files if file is not None]
+
+
+def sha256_of(file: Path, results: Path) -> str:
+    """Return a file's SHA-256; that of a large file is kept in `results` while its size and time stay."""
+    state = file.stat()
+    known_file = results / "sha256.json"
+    try:
+        known = json.loads(known_file.read_text())
+    except (OSError, ValueError):
+        known = {}
+    key = f"{file.name} {state.st_size} {state.st_mtime_ns}"
+    if key not in known:
+        with file.open("rb") as stream:
+            known[key] = hashlib.file_digest(stream, "sha256").hexdigest()
+        write_atomically(known_file, json.dumps(known, indent=1).encode())
+    return str(known[key])
+
+
+def program_version() -> str:
+    """Return the installed version of Rooftrack."""
+    try:
+        return version("rooftrack")
+    except PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,128 @@
+"""Stationary self-calibration: while the building stands still, motion that geometry still shows is calibration error.
+
+Small corrections of lens, height and reference pose, each held by a prior of the size of its own uncertainty, are
+chosen so that the target stands still in the stationary part; event frames are never used. It is the paper's own
+insight (the pre-event tells what is wrong) put into geometry instead of a filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from core.coordinates import Floats
+
+# Corrections beyond this many priors mean that something else is wrong: another lens, another height.
+SUSPICIOUS = 3.0
+ITERATIONS = 4
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One quantity that may be corrected: its name, unit, and the standard deviation of its calibration."""
+
+    name: str
+    unit: str
+    sigma: float
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """What the stationary part says about the calibration.
+
+    Attributes:
+        parameters: in the order of the arrays.
+        correction: (P,) to be added to each parameter.
+        sigma: (P,) its standard deviation afterwards.
+        rms_before_m, rms_after_m: apparent motion of the target in the stationary part.
+        covariance: (P, P) of the corrections.
+        refused: why no correction was made, or None.
+    """
+
+    parameters: tuple[Parameter, ...]
+    correction: Floats
+    sigma: Floats
+    rms_before_m: float
+    rms_after_m: float
+    covariance: Floats
+    refused: str | None = None
+
+    @property
+    def in_priors(self) -> Floats:
+        """(P,) corrections in units of their prior standard deviations."""
+        return self.correction / np.array([parameter.sigma for parameter in self.parameters])
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences about corrections that are too large to be calibration error."""
+        return tuple(
+            f"Self-calibration moves {parameter.name} by {value:+.1f} times its calibration's uncertainty; "
+            "check the lens file, the height and the clicks."
+            for parameter, value in zip(self.parameters, self.in_priors, strict=True)
+            if abs(value) > SUSPICIOUS
+        )
+
+
+def self_calibrate(
+    parameters: tuple[Parameter, ...],
+    apparent_motion: Callable[[Floats], Floats],
+    sigma_m: Floats,
+) -> SelfCalibration:
+    """Return the corrections under which the target stands still.
+
+    Args:
+        apparent_motion: leads from corrections (P,) to the target's coordinates (B, K) in B stationary moments, metres.
+        sigma_m: (B, K) noise of these coordinates; nan where a moment is not to be used.
+
+    Source: Gauss-Newton on the posterior; the priors make it a ridge regression with meaning.
+    """
+    priors = np.array([parameter.sigma for parameter in parameters])
+    usable = np.isfinite(sigma_m)
+
+    def misfit(scaled: Floats) -> Floats:
+        motion = apparent_motion(scaled * priors)
+        still = usable & np.isfinite(motion)
+        weight = np.where(still, 1.0 / np.where(usable, sigma_m, 1.0) ** 2, 0.0)
+        rest = (weight * np.nan_to_num(motion)).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
+        return np.asarray((np.where(still, motion - rest, 0.0) / np.where(usable, sigma_m, 1.0)).ravel())
+
+    scaled = np.zeros(len(priors))
+    before = misfit(scaled)
+    residual, J = before, np.zeros((before.size, len(priors)))
+    for _ in range(ITERATIONS):
+        J = _derivatives(misfit, scaled, residual)
+        weight = _huber(residual)
+        normal = (J * weight[:, None]).T @ J + np.eye(len(priors))
+        step = np.linalg.solve(normal, -(J * weight[:, None]).T @ residual - scaled)
+        scaled = scaled + step
+        residual = misfit(scaled)
+        if np.abs(step).max() < 1e-3:
+            break
+    covariance: Floats = np.asarray(np.linalg.inv(J.T @ J + np.eye(len(priors))) * np.outer(priors, priors))
+    scale = np.where(usable, sigma_m, np.nan).ravel()
+    return SelfCalibration(
+        parameters=parameters,
+        correction=scaled * priors,
+        sigma=np.sqrt(np.diag(covariance)),
+        rms_before_m=float(np.sqrt(np.nanmean((before * scale) ** 2))),
+        rms_after_m=float(np.sqrt(np.nanmean((residual * scale) ** 2))),
+        covariance=covariance,
+    )
+
+
+def refused(parameters: tuple[Parameter, ...], reason: str) -> SelfCalibration:
+    """Return a self-calibration that corrects nothing and says why."""
+    zeros, priors = np.zeros(len(parameters)), np.array([parameter.sigma for parameter in parameters])
+    return SelfCalibration(parameters, zeros, priors, float("nan"), float("nan"), np.diag(priors**2), reason)
+
+
+def _derivatives(misfit: Callable[[Floats], Floats], at: Floats, value: Floats) -> Floats:
+    """Return the derivatives (n, P) by forward differences of a fifth of a prior: far above rounding, and straight."""
+    step = 0.2
+    return np.stack([(misfit(at + step * unit) - value) / step for unit in np.eye(len(at))], axis=1)
+
+
+def _huber(residual: Floats) -> Floats:
+    return np.asarray(np.minimum(1.0, 2.5 / np.maximum(np.abs(residual), 1e-12)))

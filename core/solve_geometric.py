@@ -1,0 +1,391 @@
+"""The geometric method: poses of all frames from the ground, targets in their own plane.
+
+Self-calibration on the stationary part and smooth flight take out what calibration and single frames get wrong.
+Everything here is relative to the local origin of the reference fit, with z = 0 at the ground plane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.camera import Pose, PoseFit, fit_poses, intersect_height, plan_homographies
+from core.coordinates import Bools, Floats
+from core.errors import InputError
+from core.flight import SmoothFlight, smooth_flight
+from core.georeference import ReferenceFit, fit_reference, reference_pose
+from core.intervals import within
+from core.lens import Lens
+from core.measurements import Recording
+from core.motion import LineSet, RigidFit, fit_line, is_determined, rigid_from_lines, rigid_from_points
+from core.project import Project, Target
+from core.relief import Relief
+from core.results import Status, TargetHistory
+from core.self_calibration import Parameter, SelfCalibration, refused, self_calibrate
+from core.solution import Ground, Solution, TargetSolution, frame_status
+
+# Ground points a frame needs; below half of the usual number it is weak.
+LEAST_GROUND = 20
+# Stationary moments used for self-calibration, each the mean of the frames around it.
+MOMENTS = 48
+# Parallax below which stationary frames say nothing about the calibration, in standard deviations of a moment.
+LEAST_DRIFT_M = 0.02
+# Uncertainty of a roof's height above the ground, one standard deviation: LiDAR, and where exactly the strip lies.
+HEIGHT_SIGMA_M = 0.03
+
+
+@dataclass(frozen=True)
+class _Calibration:
+    """What self-calibration may correct, as used by one evaluation."""
+
+    lens: Lens
+    pose0: Pose
+    heights_m: Mapping[str, float]
+
+
+def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: Relief | None = None) -> Solution:
+    """Return displacement by geometry.
+
+    Args:
+        recording: measurements; see `core.measurements`.
+        relief: elevation of the ground; a plane where None.
+
+    Raises:
+        InputError: the clicks, the lens or the heights do not do.
+    """
+    heights = {target.name: _height_of(target) for target in project.targets}
+    reference = fit_with_relief(project, lens, relief)
+    assert reference.pose is not None
+    start = _Calibration(lens, reference.pose, heights)
+    calibration = _self_calibrated(recording, project, start, reference, relief)
+    used = _corrected(start, calibration, project)
+    ground = solve_ground(recording, used.lens, used.pose0, reference.origin_m, relief)
+    flight, ground = _smoothed(recording, ground, used.lens)
+    targets = {
+        target.name: _solve_target(recording, project, target, used, ground, reference.origin_m)
+        for target in project.targets
+    }
+    warnings = calibration.warnings if calibration is not None else ()
+    return Solution(
+        reference=reference,
+        lens=used.lens,
+        heights_m=used.heights_m,
+        ground=ground,
+        targets=targets,
+        histories={name: solved.history for name, solved in targets.items()},
+        self_calibration=calibration,
+        flight=flight,
+        warnings=warnings,
+    )
+
+
+def _height_of(target: Target) -> float:
+    if target.height_m is None:
+        raise InputError(
+            f'project.json: targets.{target.name}.height_m is missing; "geometric" needs its height above '
+            'the ground, "paper" does without.'
+        )
+    return target.height_m
+
+
+def click_elevation(project: Project, relief: Relief | None) -> Floats | None:
+    """Return how far the ground lies above the datum at each click (N,), or None where it is not known."""
+    if relief is None or not project.correspondences:
+        return None
+    return relief.at(np.array([pair.ground_m for pair in project.correspondences]))
+
+
+def fit_with_relief(project: Project, lens: Lens, relief: Relief | None, *, has_lens: bool = True) -> ReferenceFit:
+    """Return the reference fit of the project's clicks, with the ground's own elevation below them where known."""
+    elevation = click_elevation(project, relief)
+    return fit_reference(project.correspondences, lens, has_lens=has_lens, elevation_m=elevation)
+
+
+def ground_points(raw: Floats, lens: Lens, pose0: Pose, origin_m: Floats, relief: Relief | None) -> Floats:
+    """Return the world coordinates (N, 3) of ground features seen at raw reference pixels (N, 2)."""
+    rays = lens.rays_from_raw(raw)
+    xy = intersect_height(pose0.R, pose0.centre_m, rays, 0.0)
+    z = np.zeros(len(xy))
+    for _ in range(2 if relief is not None else 0):
+        assert relief is not None
+        z = relief.at(xy + origin_m)
+        xy = intersect_height(pose0.R, pose0.centre_m, rays, z)
+    return np.column_stack([xy, z])
+
+
+def solve_ground(recording: Recording, lens: Lens, pose0: Pose, origin_m: Floats, relief: Relief | None) -> Ground:
+    """Return the pose of every frame from the ground features."""
+    points = ground_points(recording.reference.ground_raw, lens, pose0, origin_m, relief)
+    rays = lens.rays_from_raw(recording.ground_raw)
+    weight = np.isfinite(points).all(axis=1) * np.ones(len(rays))[:, None]
+    focal = float(lens.focal_px.mean())
+    poses = fit_poses(rays, weight, np.nan_to_num(points), pose0, sigma_floor=0.01 / focal)
+    return _assessed(points, poses, focal)
+
+
+def _assessed(points: Floats, poses: PoseFit, focal: float) -> Ground:
+    inlier = poses.weight > 0.1
+    squared = np.where(inlier, (np.nan_to_num(poses.residual) ** 2).sum(axis=-1), 0.0)
+    count = inlier.sum(axis=1)
+    rms = np.sqrt(squared.sum(axis=1) / np.maximum(2 * count, 1)) * focal
+    usable = (count >= LEAST_GROUND) & np.isfinite(poses.centre_m).all(axis=1) & (poses.centre_m[:, 2] > 0)
+    return Ground(points, poses.weight, plan_homographies(poses.R, poses.centre_m), poses, rms, count, usable)
+
+
+def _smoothed(recording: Recording, ground: Ground, lens: Lens) -> tuple[SmoothFlight | None, Ground]:
+    """Smooth the camera's path and fit each frame's rotation anew about the smoothed centre."""
+    if ground.usable.sum() < 30:
+        return None, ground
+    covariance = (
+        np.linalg.pinv(ground.known_poses.normal, hermitian=True) * (ground.known_poses.sigma**2)[:, None, None]
+    )
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2)[:, 3:], 1e-18))
+    centre = np.where(ground.usable[:, None], ground.known_poses.centre_m, np.nan)
+    flight = smooth_flight(recording.time_s, centre, np.where(ground.usable[:, None], sigma, np.nan))
+    path = np.where(np.isfinite(flight.value_m), flight.value_m, ground.known_poses.centre_m)
+    rays = lens.rays_from_raw(recording.ground_raw)
+    poses = fit_poses(
+        rays,
+        ground.known_poses.weight,
+        ground.points_m,
+        ground.known_poses,
+        iterations=3,
+        robust=False,
+        fixed_centre_m=path,
+    )
+    poses = replace(poses, weight=ground.known_poses.weight, sigma=ground.known_poses.sigma)
+    return flight, replace(ground, poses=poses, H_plan_ray=plan_homographies(poses.R, poses.centre_m))
+
+
+# --- targets ---------------------------------------------------------------------------------------------------------
+
+
+def world_points(raw: Floats, lens: Lens, poses: PoseFit | Pose, z_m: float) -> Floats:
+    """Return local x, y (F, ..., 2) of raw pixels (F, ..., 2) on the plane z, seen from each frame's pose."""
+    rays = lens.rays_from_raw(raw)
+    flat = rays.reshape(len(rays), -1, 2)
+    return intersect_height(poses.R, poses.centre_m, flat, z_m).reshape(rays.shape)
+
+
+def _solve_target(
+    recording: Recording,
+    project: Project,
+    target: Target,
+    used: _Calibration,
+    ground: Ground,
+    origin_m: Floats,
+) -> TargetSolution:
+    height = used.heights_m[target.name]
+    body = rest_body(recording, target.name, used.lens, used.pose0, height)
+    points = world_points(_midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, height)
+    still = _stationary(recording.time_s, project)
+    fit = body.fit(points, still & ground.usable)
+    used_points = (fit.weight > 0.1).reshape(len(fit.weight), -1).sum(axis=1)
+    status = frame_status(recording, project, ground, used_points, is_determined(fit.normal))
+    apparent = world_points(_midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, 0.0)
+    flat = rest_body(recording, target.name, used.lens, used.pose0, 0.0)
+    raw = flat.fit(apparent, np.zeros(len(apparent), dtype=bool))
+    scale = _paper_scale(target, flat, used.pose0, height)
+    shift = _from_rest(np.stack([fit.at(place, body.centre) for place in body.places], 1), fit, still, status)
+    sigma = _sigma(fit, body)
+    history = TargetHistory(
+        name=target.name,
+        frame=recording.frame,
+        time_s=recording.time_s,
+        status=status,
+        p1_m=shift[0][:, 0],
+        p2_m=shift[0][:, 1],
+        rotation_rad=shift[1],
+        p1_sigma_m=sigma[0],
+        p2_sigma_m=sigma[1],
+        rotation_sigma_rad=sigma[2],
+        p1_raw_m=scale * raw.at(flat.places[0], flat.centre),
+        p2_raw_m=scale * raw.at(flat.places[1], flat.centre),
+        rotation_raw_rad=raw.rotation_rad,
+    )
+    return TargetSolution(history=history, rest_m=body.places + origin_m)
+
+
+@dataclass(frozen=True)
+class RestBody:
+    """A target as it lies in the reference frame, in one plane.
+
+    Attributes:
+        lines: of a lines target, else None.
+        points: (N, 2) of a points target, else None.
+        centre: (2,) pivot.
+        places: (2, 2) P1 and P2.
+    """
+
+    lines: LineSet | None
+    points: Floats | None
+    centre: Floats
+    places: Floats
+
+    def fit(self, points: Floats, still: Bools) -> RigidFit:
+        """Return the motion of F frames from points (F, L, S, 2) or (F, N, 2).
+
+        Args:
+            still: (F,) frames from which lasting departures of a strip from a straight line are learnt.
+        """
+        weight = np.ones(points.shape[:-1])
+        if self.points is not None:
+            return rigid_from_points(points, weight, self.points, self.centre)
+        assert self.lines is not None
+        fit = rigid_from_lines(points, weight, self.lines)
+        if still.sum() < 10:
+            return fit
+        residual = fit.residual[still]
+        seen = np.isfinite(residual).sum(axis=0) >= 5
+        pattern = np.where(seen, np.nanmedian(np.where(seen, residual, 0.0), axis=0), 0.0)
+        return rigid_from_lines(points, weight, self.lines, pattern=np.nan_to_num(pattern))
+
+
+def _midpoints(raw: Floats) -> Floats:
+    """Return what carries the motion: mid-lines (F, L, S, 2) of edges (F, L, S, 2, 2), or patches as they are."""
+    return raw.mean(axis=-2) if raw.ndim == 5 else raw
+
+
+def rest_body(recording: Recording, name: str, lens: Lens, pose0: Pose, z_m: float) -> RestBody:
+    """Return a target as it lies in the reference frame, on the plane z.
+
+    P1 and P2 are L1 and L2 met by T1; of a points target, the ends of its region's longer axis.
+    """
+    raw = _midpoints(recording.reference.targets_raw[name][None])
+    places = world_points(raw, lens, Pose(pose0.R[None], pose0.centre_m[None]), z_m)[0]
+    if places.ndim == 2:
+        centre = np.nanmean(places, axis=0)
+        _, _, axes = np.linalg.svd(places - centre, full_matrices=False)
+        arm = axes[0] * np.ptp((places - centre) @ axes[0]) / 4
+        return RestBody(None, places, centre, np.stack([centre + arm, centre - arm]))
+    centre = np.nanmean(places.reshape(-1, 2), axis=0)
+    fits = [fit_line(line, np.ones(len(line)), centre) for line in places]
+    lines = LineSet(np.array([n for n, _ in fits]), np.array([o for _, o in fits]), centre)
+    return RestBody(lines, None, centre, np.stack([lines.intersection(0, 2), lines.intersection(1, 2)]))
+
+
+def _paper_scale(target: Target, flat: RestBody, pose0: Pose, height_m: float) -> float:
+    """Return metres at roof level per plan metre: from the known distance P1-P2, or else from the heights."""
+    if target.p1_p2_m is not None and target.kind == "lines":
+        return target.p1_p2_m / float(np.linalg.norm(flat.places[0] - flat.places[1]))
+    return float((pose0.centre_m[2] - height_m) / pose0.centre_m[2])
+
+
+def _stationary(time_s: Floats, project: Project) -> Bools:
+    """Return which frames the project says the building stood still in before the event, and nobody rejected."""
+    interval = project.intervals_s.pre_event
+    return within(time_s, interval) if interval is not None else np.zeros(len(time_s), dtype=bool)
+
+
+def _from_rest(places: Floats, fit: RigidFit, still: Bools, status: NDArray[np.str_]) -> tuple[Floats, Floats]:
+    """Return displacements (F, 2, 2) and rotations (F,) from their mean in the stationary part, where there is one."""
+    good = still & ((status == Status.OK) | (status == Status.WEAK))
+    if not good.any():
+        return places, fit.rotation_rad
+    return places - places[good].mean(axis=0), fit.rotation_rad - fit.rotation_rad[good].mean()
+
+
+def _sigma(fit: RigidFit, body: RestBody) -> tuple[Floats, Floats, Floats]:
+    covariance = np.linalg.pinv(fit.normal, hermitian=True)
+    sigmas = []
+    for place in body.places:
+        arm = place - body.centre
+        J = np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]]])
+        sigmas.append(np.sqrt(np.diagonal(J @ covariance @ J.T, axis1=1, axis2=2)))
+    return sigmas[0], sigmas[1], np.sqrt(covariance[:, 2, 2])
+
+
+# --- self-calibration ------------------------------------------------------------------------------------------------
+
+
+def _parameters(lens: Lens, project: Project) -> tuple[Parameter, ...]:
+    sigma, (fx, fy) = lens.sigma, lens.focal_px
+    return (
+        Parameter("fx", "px", sigma.focal_relative * fx),
+        Parameter("fy", "px", sigma.focal_relative * fy),
+        Parameter("cx", "px", sigma.centre_px),
+        Parameter("cy", "px", sigma.centre_px),
+        Parameter("k1", "1", sigma.k1),
+        Parameter("k2", "1", sigma.k2),
+        *(Parameter(f"height of {target.name}", "m", HEIGHT_SIGMA_M) for target in project.targets),
+    )
+
+
+def _corrected(start: _Calibration, calibration: SelfCalibration | None, project: Project) -> _Calibration:
+    if calibration is None:
+        return start
+    return _with_correction(start, calibration.correction, project)
+
+
+def _with_correction(start: _Calibration, correction: Floats, project: Project) -> _Calibration:
+    K, d = start.lens.camera_matrix.copy(), start.lens.distortion.copy()
+    K[[0, 1, 0, 1], [0, 1, 2, 2]] += correction[:4]
+    d[:2] += correction[4:6]
+    lens = replace(start.lens, camera_matrix=K, distortion=d)
+    heights = {
+        target.name: start.heights_m[target.name] + float(extra)
+        for target, extra in zip(project.targets, correction[6:], strict=True)
+    }
+    return _Calibration(lens, start.pose0, heights)
+
+
+def _self_calibrated(
+    recording: Recording, project: Project, start: _Calibration, reference: ReferenceFit, relief: Relief | None
+) -> SelfCalibration | None:
+    parameters = _parameters(start.lens, project)
+    still = _stationary(recording.time_s, project)
+    if project.intervals_s.pre_event is None:
+        return refused(parameters, "no pre-event interval is given")
+    moments = _moments(recording, still)
+    if len(moments.time_s) < 12:
+        return refused(parameters, "the pre-event interval holds too few frames")
+    ground = solve_ground(moments, start.lens, start.pose0, reference.origin_m, relief)
+    drift = ground.known_poses.centre_m[ground.usable].std(axis=0)[:2] if ground.usable.any() else np.zeros(2)
+    if float(np.hypot(*drift)) < LEAST_DRIFT_M:
+        return refused(parameters, f"the camera drifted by {np.hypot(*drift) * 100:.1f} cm only, too little to tell")
+
+    elevation = click_elevation(project, relief)
+
+    def apparent_motion(correction: Floats) -> Floats:
+        used = _with_correction(start, correction, project)
+        pose0 = reference_pose(project.correspondences, used.lens, reference.origin_m, elevation)
+        solved = solve_ground(moments, used.lens, pose0, reference.origin_m, relief)
+        columns = []
+        for target in project.targets:
+            height = used.heights_m[target.name]
+            body = rest_body(moments, target.name, used.lens, pose0, height)
+            points = world_points(_midpoints(moments.targets_raw[target.name]), used.lens, solved.known_poses, height)
+            fit = body.fit(points, np.zeros(len(points), dtype=bool))
+            columns += [fit.at(place, body.centre) for place in body.places]
+        motion = np.concatenate(columns, axis=1)
+        return np.where(solved.usable[:, None], motion, np.nan)
+
+    motion = apparent_motion(np.zeros(len(parameters)))
+    noise = 1.4826 * np.nanmedian(np.abs(np.diff(motion, n=2, axis=0)), axis=0) / np.sqrt(6.0)
+    sigma = np.where(np.isfinite(motion), np.maximum(noise, 2e-5), np.nan)
+    return self_calibrate(parameters, apparent_motion, sigma)
+
+
+def _moments(recording: Recording, still: Bools) -> Recording:
+    """Return the stationary part as at most `MOMENTS` means of neighbouring frames, each less noisy than one frame."""
+    groups = [g for g in np.array_split(np.flatnonzero(still), MOMENTS) if len(g)]
+
+    def mean(values: Floats) -> Floats:
+        return np.stack([_mean_seen(values[group]) for group in groups]) if groups else values[:0]
+
+    return replace(
+        recording,
+        frame=np.arange(len(groups)),
+        time_s=np.array([recording.time_s[group].mean() for group in groups]),
+        H_ray_ray0=recording.H_ray_ray0[[int(group[0]) for group in groups]],
+        ground_raw=mean(recording.ground_raw),
+        targets_raw={name: mean(raw) for name, raw in recording.targets_raw.items()},
+    )
+
+
+def _mean_seen(values: Floats) -> Floats:
+    """Return the mean over frames of what was seen in all of them; a mean of some would be that of other moments."""
+    return np.asarray(values.mean(axis=0))

@@ -1,0 +1,150 @@
+"""The published method's geometry: a homography per frame onto the ground plane, lines by regression, P1 and P2.
+
+Source: the paper, "UAV Drift and Perspective Correction", "Roof Feature Detection and Displacement Extraction".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from core.camera import intersect_height
+from core.coordinates import Bools, Floats, apply_homography, finite_rows
+from core.errors import InputError
+from core.georeference import ReferenceFit
+from core.ground import LEAST_POINTS, fit_homography
+from core.lens import Lens
+from core.measurements import Recording
+from core.motion import regress_lines
+from core.project import Project, Target
+from core.relief import Relief
+from core.results import TargetHistory
+from core.solution import Ground, Solution, TargetSolution, frame_status
+from core.solve_geometric import fit_with_relief
+
+
+def solve_paper(
+    recording: Recording, project: Project, lens: Lens, relief: Relief | None = None, *, has_lens: bool = True
+) -> Solution:
+    """Return displacement the published way; drift is left in, for the filter to take out.
+
+    Args:
+        recording: measurements by `core.paper`.
+        lens, relief, has_lens: as in `core.solve.solve`.
+
+    Raises:
+        InputError: the clicks do not do, or neither P1-P2 nor a height tells the scale at the roof.
+    """
+    reference = fit_with_relief(project, lens, relief, has_lens=has_lens)
+    ground = stabilise(recording, lens, reference.H_plan_ray)
+    targets = {target.name: _solve_target(recording, project, target, reference, ground) for target in project.targets}
+    return Solution(
+        reference=reference,
+        lens=lens,
+        heights_m={target.name: target.height_m for target in project.targets},
+        ground=ground,
+        targets=targets,
+        histories={name: solved.history for name, solved in targets.items()},
+        self_calibration=None,
+        flight=None,
+        warnings=(),
+    )
+
+
+def stabilise(recording: Recording, lens: Lens, H_plan_ray0: Floats) -> Ground:
+    """Return every frame's robust homography onto the ground plane, from its matches to the reference frame."""
+    rays0 = lens.rays_from_raw(recording.reference.ground_raw)
+    rays = lens.rays_from_raw(recording.ground_raw)
+    focal = float(lens.focal_px.mean())
+    frames, points = rays.shape[:2]
+    H_plan_ray = np.full((frames, 3, 3), np.nan)
+    weight, rms_px = np.zeros((frames, points)), np.full(frames, np.nan)
+    for number, seen in enumerate(finite_rows(rays)):
+        if seen.sum() < LEAST_POINTS:
+            continue
+        H, inlier = fit_homography(rays0[seen], rays[number, seen], tolerance=1.0 / focal)
+        if H is None or inlier.sum() < LEAST_POINTS:
+            continue
+        weight[number, np.flatnonzero(seen)[inlier]] = 1.0
+        H_plan_ray[number] = H_plan_ray0 @ np.linalg.inv(H)
+        error = apply_homography(H, rays0[seen][inlier]) - rays[number, seen][inlier]
+        rms_px[number] = float(np.sqrt((error**2).mean())) * focal
+    plan = apply_homography(H_plan_ray0, rays0)
+    return Ground(
+        points_m=np.column_stack([plan, np.zeros(points)]),
+        weight=weight,
+        H_plan_ray=H_plan_ray,
+        poses=None,
+        rms_px=rms_px,
+        inliers=weight.astype(bool).sum(axis=1),
+        usable=np.isfinite(H_plan_ray).all(axis=(1, 2)),
+    )
+
+
+def plan_points(raw: Floats, lens: Lens, H_plan_ray: Floats) -> Floats:
+    """Return local plan metres (F, ..., 2) of raw pixels (F, ..., 2), each frame by its own homography (F, 3, 3)."""
+    rays = lens.rays_from_raw(raw)
+    flat = rays.reshape(len(rays), -1, 2)
+    mapped = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=2) @ np.swapaxes(H_plan_ray, 1, 2)
+    return np.asarray((mapped[..., :2] / mapped[..., 2:]).reshape(rays.shape))
+
+
+def _solve_target(
+    recording: Recording, project: Project, target: Target, reference: ReferenceFit, ground: Ground
+) -> TargetSolution:
+    lens = reference.lens
+    raw = np.concatenate([recording.reference.targets_raw[target.name][None], recording.targets_raw[target.name]])
+    H = np.concatenate([reference.H_plan_ray[None], ground.H_plan_ray])
+    lines = regress_lines(plan_points(raw.mean(axis=-2), lens, H))
+    places = np.stack([lines.intersection(0, 2), lines.intersection(1, 2)], axis=1)
+    spread = np.stack([lines.intersection_sigma(0, 2), lines.intersection_sigma(1, 2)], axis=1)
+    scale = _scale(target, reference, places[0])
+    moved = scale * (places[1:] - places[0])
+    angle = np.arctan2(*np.moveaxis(places[:, 0] - places[:, 1], -1, 0)[::-1])
+    turned = np.angle(np.exp(1j * (angle[1:] - angle[0])))
+    sigma = scale * spread[1:]
+    distance = float(np.linalg.norm(places[0, 0] - places[0, 1]))
+    determined: Bools = np.isfinite(moved).all(axis=(1, 2))
+    status = frame_status(recording, project, ground, lines.used[1:].sum(axis=1), determined)
+    history = TargetHistory(
+        name=target.name,
+        frame=recording.frame,
+        time_s=recording.time_s,
+        status=status,
+        p1_m=moved[:, 0],
+        p2_m=moved[:, 1],
+        rotation_rad=turned,
+        p1_sigma_m=sigma[:, 0],
+        p2_sigma_m=sigma[:, 1],
+        rotation_sigma_rad=np.sqrt((spread[1:] ** 2).sum(axis=(1, 2)) / 2) / distance,
+        p1_raw_m=moved[:, 0],
+        p2_raw_m=moved[:, 1],
+        rotation_raw_rad=turned,
+    )
+    return TargetSolution(history=history, rest_m=_rest(target, reference, places[0]) + reference.origin_m)
+
+
+def _scale(target: Target, reference: ReferenceFit, places: Floats) -> float:
+    """Return metres at roof level per plan metre, from the known distance P1-P2 or else from the heights.
+
+    Raises:
+        InputError: neither is known.
+
+    Source: the paper, Fig. 6(a).
+    """
+    if target.p1_p2_m is not None:
+        return target.p1_p2_m / float(np.linalg.norm(places[0] - places[1]))
+    if target.height_m is not None and reference.pose is not None:
+        return float(1.0 - target.height_m / reference.pose.centre_m[2])
+    raise InputError(
+        f'project.json: targets.{target.name}.p1_p2_m is missing; "paper" takes its scale from the known distance '
+        "P1-P2, or from height_m and a lens."
+    )
+
+
+def _rest(target: Target, reference: ReferenceFit, places: Floats) -> Floats:
+    """Return P1 and P2 at rest (2, 2), local: at their own height where it is known, else where they appear."""
+    if target.height_m is None or reference.pose is None:
+        return places
+    pose = reference.pose
+    rays = apply_homography(np.linalg.inv(reference.H_plan_ray), places)
+    return intersect_height(pose.R, pose.centre_m, rays, target.height_m)

@@ -1,0 +1,290 @@
+"""Video in: upright luma planes with the container's own timestamps, in presentation order, in constant memory.
+
+Everything is measured on luma, which a decoder delivers without any conversion. Frame numbers count presentation
+order from 0; times are seconds since the first presented frame. Edit lists and rotation flags are honoured.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import av
+import numpy as np
+from av.container import InputContainer
+from av.video.frame import VideoFrame
+from av.video.stream import VideoStream
+from numpy.typing import NDArray
+
+from core.errors import InputError
+
+Luma = NDArray[np.uint8]
+# Frames decoded ahead of the one being measured: enough to keep the decoder busy, 12 MB each at 4K.
+READ_AHEAD = 6
+EIGHT_BIT_LUMA = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What a container says of its video, upright.
+
+    Attributes:
+        frames: as declared by the container; None where it does not say.
+        rotation_deg: clockwise turn that was applied to make frames upright (0, 90, 180, 270).
+    """
+
+    width: int
+    height: int
+    frames: int | None
+    duration_s: float
+    rate_hz: float
+    codec: str
+    rotation_deg: int
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One presented frame: `luma` is (height, width), raw pixels, read-only by convention."""
+
+    index: int
+    time_s: float
+    luma: Luma
+
+
+@dataclass(frozen=True)
+class FrameIndex:
+    """Where every presented frame lies: timestamps in stream ticks, ascending, and which may be decoded first."""
+
+    ticks: tuple[int, ...]
+    key_ticks: tuple[int, ...]
+    tick_s: float
+
+    def __len__(self) -> int:
+        return len(self.ticks)
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """(F,) seconds since the first presented frame."""
+        return (np.array(self.ticks, dtype=np.float64) - self.ticks[0]) * self.tick_s
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+    try:
+        container = av.open(str(path))
+    except FileNotFoundError:
+        raise InputError(f"{path}: not found; correct inputs.video or put the file there.") from None
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be opened as a video ({_reason(error)}); export it again as MP4.") from None
+    with container:
+        if not container.streams.video:
+            raise InputError(f"{path}: holds no video stream; choose the file with the pictures.")
+        yield container, container.streams.video[0]
+
+
+def _reason(error: Exception) -> str:
+    return str(getattr(error, "strerror", None) or error)
+
+
+def probe(path: Path) -> VideoInfo:
+    """Return what the container and its first frame say, without reading the rest.
+
+    Raises:
+        InputError: no such file, no container, no video stream, or no frame that can be decoded.
+    """
+    with _opened(path) as (container, stream):
+        try:
+            frame = next(container.decode(stream))
+        except (StopIteration, av.error.FFmpegError):
+            raise InputError(f"{path}: not one frame can be decoded; export the video again as H.264 MP4.") from None
+        quarter_turned = frame.rotation % 180 != 0
+        width, height = (frame.height, frame.width) if quarter_turned else (frame.width, frame.height)
+        duration_s = _duration_s(container, stream)
+        rate_hz = float(stream.average_rate or stream.guessed_rate or 0)
+        return VideoInfo(
+            width=width,
+            height=height,
+            frames=stream.frames or None,
+            duration_s=duration_s,
+            rate_hz=rate_hz,
+            codec=stream.codec_context.name,
+            rotation_deg=-frame.rotation % 360,
+        )
+
+
+def _duration_s(container: InputContainer, stream: VideoStream) -> float:
+    if stream.duration is not None and stream.time_base is not None:
+        return float(stream.duration * stream.time_base)
+    return float(container.duration or 0) / av.time_base
+
+
+def frame_index(path: Path) -> FrameIndex:
+    """Return the index of all presented frames, read from the packets without decoding; kept while the file stays.
+
+    Raises:
+        InputError: as `probe`.
+    """
+    try:
+        state = path.stat()
+    except OSError:
+        raise InputError(f"{path}: not found; correct inputs.video or put the file there.") from None
+    return _frame_index(path.resolve(), state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=16)
+def _frame_index(path: Path, size: int, modified_ns: int) -> FrameIndex:
+    ticks: list[int] = []
+    keys: list[int] = []
+    with _opened(path) as (container, stream):
+        try:
+            for packet in container.demux(stream):
+                if packet.pts is None or packet.is_discard:
+                    continue
+                ticks.append(packet.pts)
+                if packet.is_keyframe:
+                    keys.append(packet.pts)
+        except av.error.FFmpegError:
+            pass  # a file cut off in the middle: what came before it can still be measured
+        tick_s = float(stream.time_base or 0)
+    if not ticks:
+        raise InputError(f"{path}: its video stream holds no frames; export the video again.")
+    return FrameIndex(ticks=tuple(sorted(ticks)), key_ticks=tuple(sorted(keys)), tick_s=tick_s)
+
+
+def read_frames(path: Path, start: int = 0, stop: int | None = None, *, threads: int = 0) -> Iterator[Frame]:
+    """Yield frames `start` to `stop` (exclusive; None for all), decoding ahead in a thread of its own.
+
+    Args:
+        threads: decoder threads, 0 for one per core.
+
+    Raises:
+        InputError: the file cannot be read, or `start` lies beyond its end.
+    """
+    ahead: queue.Queue[Frame | Exception | None] = queue.Queue(maxsize=READ_AHEAD)
+    stopped = threading.Event()
+
+    def hand_over(item: Frame | Exception | None) -> bool:
+        while not stopped.is_set():
+            try:
+                ahead.put(item, timeout=0.1)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+    def decode() -> None:
+        try:
+            for frame in _decoded(path, start, stop, threads):
+                if not hand_over(frame):
+                    return
+            hand_over(None)
+        except Exception as error:  # handed to the reading thread, which raises it
+            hand_over(error)
+
+    thread = threading.Thread(target=decode, name="video decoder", daemon=True)
+    thread.start()
+    try:
+        while (item := ahead.get()) is not None:
+            if isinstance(item, Exception):
+                raise item
+            yield item
+    finally:
+        stopped.set()
+        thread.join()
+
+
+def read_frame(path: Path, index: int) -> Frame:
+    """Return one frame by its number.
+
+    Raises:
+        InputError: as `read_frames`, or there is no such frame.
+    """
+    for frame in _decoded(path, index, index + 1, 0):
+        return frame
+    raise InputError(f"{path}: has no frame {index}; choose a smaller frame number.")
+
+
+def read_frame_rgb(path: Path, index: int) -> NDArray[np.uint8]:
+    """Return one frame as (height, width, 3) RGB for people to look at.
+
+    Raises:
+        InputError: as `read_frame`.
+    """
+    for _, rgb in read_frames_rgb(path, index, index + 1):
+        return rgb
+    raise InputError(f"{path}: has no frame {index}; choose a smaller frame number.")
+
+
+def read_frames_rgb(path: Path, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Yield numbers and pictures of frames from `start` on, each (height, width, 3) RGB upright.
+
+    Raises:
+        InputError: as `read_frames`.
+    """
+    for picture, index in _pictures(path, start, stop, 0):
+        yield index, np.ascontiguousarray(np.rot90(picture.to_ndarray(format="rgb24"), picture.rotation // 90))
+
+
+def _decoded(path: Path, start: int, stop: int | None, threads: int) -> Iterator[Frame]:
+    first_tick: int | None = frame_index(path).ticks[0] if start > 0 else None
+    for picture, index in _pictures(path, start, stop, threads):
+        if first_tick is None:
+            first_tick = picture.pts or 0
+        time_s = float(((picture.pts or 0) - first_tick) * (picture.time_base or 0))
+        yield Frame(index=index, time_s=time_s, luma=luma_of(picture))
+
+
+def _pictures(path: Path, start: int, stop: int | None, threads: int) -> Iterator[tuple[VideoFrame, int]]:
+    """Yield decoded pictures with their frame numbers; numbers after a seek come from the timestamps alone."""
+    with _opened(path) as (container, stream):
+        stream.codec_context.thread_type = "AUTO"
+        stream.codec_context.thread_count = threads
+        position = _seek(container, stream, path, start) if start > 0 else None
+        number = 0
+        for picture in _until_damaged(container, stream):
+            if position is not None:
+                if picture.pts is None or picture.pts not in position:
+                    continue
+                number = position[picture.pts]
+            if number >= start:
+                if stop is not None and number >= stop:
+                    return
+                yield picture, number
+            number += 1
+
+
+def _until_damaged(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
+    """Decode to the end of the stream or of what can be read of it."""
+    pictures = container.decode(stream)
+    while True:
+        try:
+            yield next(pictures)
+        except (StopIteration, av.error.InvalidDataError):
+            return
+
+
+def _seek(container: InputContainer, stream: VideoStream, path: Path, start: int) -> dict[int, int]:
+    """Go to the last key frame at or before frame `start`; return the frame number of every timestamp."""
+    index = frame_index(path)
+    if start >= len(index):
+        raise InputError(f"{path}: has {len(index)} frames, so there is no frame {start}; choose a smaller number.")
+    keys = [tick for tick in index.key_ticks if tick <= index.ticks[start]]
+    if keys:
+        container.seek(keys[-1], stream=stream, backward=True)
+    return {tick: number for number, tick in enumerate(index.ticks)}
+
+
+def luma_of(picture: VideoFrame) -> Luma:
+    """Return a picture's luma plane, (height, width) upright, copied only where it must be turned or converted."""
+    if picture.format.name in EIGHT_BIT_LUMA:
+        plane = picture.planes[0]
+        rows = np.frombuffer(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)
+        luma: Luma = rows[: picture.height, : picture.width]
+    else:
+        luma = np.asarray(picture.to_ndarray(format="gray"), dtype=np.uint8)
+    return np.ascontiguousarray(np.rot90(luma, picture.rotation // 90)) if picture.rotation else luma
