@@ -38,6 +38,7 @@ import { drawIntervals, drawStatuses, drawVerticals, IntervalHandles } from "./p
  * @property {boolean} [logX]
  * @property {boolean} [logY]
  * @property {boolean} [zeroY] the y axis starts at 0
+ * @property {number} [leastSpan] the y axis never shows less, so that noise is not mistaken for motion
  * @property {number} [seekStep] how far an arrow key moves, in the unit of x; default: one value
  */
 
@@ -248,7 +249,8 @@ export class Plot extends Emitter {
   rangeY(low, high) {
     if (low == null || high == null) return this.options.logY ? [1e-4, 1e-2] : [-0.01, 0.01];
     if (this.options.logY) return this.rangeLog(low, high);
-    const air = Math.max((high - low) * 0.08, this.options.unit === "m" ? 5e-5 : 1e-9);
+    const lacking = ((this.options.leastSpan ?? 1e-9) - (high - low)) / 2;
+    const air = Math.max((high - low) * 0.08, lacking);
     const range = /** @type {[number, number]} */ ([this.options.zeroY ? 0 : low - air, high + air]);
     this.chooseUnit(range);
     return range;

@@ -73,7 +73,7 @@ fill(
 const view = new FrameView(frameBox, new FrameLibrary(page.id, { size: [video.width, video.height], count: video.frames }), method);
 const scene = new SceneView(sceneBox, page.id);
 const player = new Player(transport);
-const plots = AXES.map((axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "review", drag: "seek" }));
+const plots = AXES.map((axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "review", drag: "seek", leastSpan: 0.002 }));
 const solver = new Solver(page, () => results.ready && !results.stale);
 const exclusions = new ExclusionEditor(excluded, { store, solver, onSelection: showSelection, onJump: (frame) => player.go(frame) });
 

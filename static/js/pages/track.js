@@ -2,7 +2,7 @@
 
 import { get, post, projectPath, remove, sentence } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
-import { count, duration, fixed, plural } from "../lib/format.js";
+import { count, duration, fixed, millimetres, pixels, plural } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { stepUrl } from "../components/header.js";
@@ -45,7 +45,7 @@ fill(
     h("div", { class: "stage-body padded" }, plotArea, empty)),
   h("aside", { class: "side", "aria-label": "Run" }, controls, methods, facts),
 );
-const plots = AXES.map((axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "track", drag: "view" }));
+const plots = AXES.map((axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "track", drag: "view", leastSpan: 0.02 }));
 plots.forEach((plot, i) => plot.setTraces([{ label: "P1", colour: i === 0 ? "--series-1" : "--series-2" }], [[], []]));
 
 page.keys([
@@ -196,6 +196,7 @@ function showControls() {
     problems.length === 0 && track.resumable ? note("info", stoppedWords()) : null,
     problems.length === 0 && results?.stale ? note("warn", store.state.steps.track.message || "The project has changed since these results were made.") : null,
     done && job?.state !== "failed" ? note("good", doneWords()) : null,
+    ...(done ? (results?.summary?.warnings ?? []) : []).map((/** @type {string} */ warning) => note("warn", warning)),
   ];
   fill(controls, h("header", {}, h("h2", {}, "Measurement")), notes, buttons(Boolean(done)));
 }
@@ -233,8 +234,8 @@ function stoppedWords() {
 }
 
 function doneWords() {
-  const { frames, seconds } = results?.summary ?? {};
-  const speed = frames && seconds ? ` in ${duration(seconds)}, ${fixed(frames / seconds, 1)} frames/s` : "";
+  const { frames, frames_measured, seconds, frames_per_second } = results?.summary ?? {};
+  const speed = frames_measured && frames_per_second ? ` in ${duration(seconds)}, ${fixed(frames_per_second, 1)} frames/s` : "";
   return `Measured ${plural(frames ?? track.frames_total, "frame")}${speed}.`;
 }
 
@@ -260,7 +261,7 @@ function chooseMethod(method) {
 
 function showFacts() {
   const counts = results?.summary?.targets?.[currentTarget()]?.counts;
-  facts.hidden = !results?.ready || !counts;
+  facts.hidden = !results?.ready || !counts || isRunning(track.job);
   if (facts.hidden) return;
   const statusLine = (/** @type {string} */ status, /** @type {string} */ words) => [h("dt", {}, h("span", { class: `status-key ${status}` }), status), h("dd", {}, `${count(counts[status] ?? 0)} `, h("span", { class: "faint" }, words))];
   fill(
@@ -271,5 +272,20 @@ function showFacts() {
       statusLine("weak", "measured from few points"),
       statusLine("lost", "could not be measured"),
       statusLine("excluded", "rejected by you")),
+    h("header", {}, h("h2", {}, "Quality")),
+    h("dl", { class: "facts" }, qualityFacts()),
   );
+}
+
+/** What the engine says of its own fits. */
+function qualityFacts() {
+  const { reference_fit: reference, ground_fit: ground, self_calibration: calibration, targets } = results?.summary ?? {};
+  const sigma = targets?.[currentTarget()]?.sigma_median_m;
+  const fact = (/** @type {string} */ name, /** @type {string} */ value, /** @type {string} */ words = "") => [h("dt", {}, name), h("dd", {}, value, words && h("span", { class: "faint" }, ` ${words}`))];
+  return [
+    reference ? fact("Reference", pixels(reference.rms_px), `RMS, ${pixels(reference.left_out_rms_px)} leave-one-out`) : [],
+    ground ? fact("Ground", `${count(ground.median_inliers)} features`, `a frame, ${pixels(ground.rms_px)} RMS`) : [],
+    sigma ? fact("Noise", `${millimetres(sigma.x, 2)} / ${millimetres(sigma.y, 2)}`, "1 σ, east / north") : [],
+    calibration?.rms_after_m ? fact("At rest", millimetres(calibration.rms_after_m, 2), `RMS after self-calibration, ${millimetres(calibration.rms_before_m, 2)} before`) : [],
+  ].flat();
 }

@@ -1,0 +1,288 @@
+"""Track, review, drift, export as a person uses them: real server, real engine, real Chromium, a rendered scene."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Page, expect
+
+from core.drift import high_pass
+from core.project import read_project
+from core.results import read_history_csv
+from tests.browser.live import ask, chromium, free_port, measured_scene, serving, watched
+
+FRAME = 120  # in the middle of the shaking
+WITHIN_PX = 0.5
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return measured_scene(tmp_path_factory.getbasetemp().parent / "results-pages")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture
+def workspace(scene, tmp_path):
+    """A workspace with the scene measured by the headless engine."""
+    shutil.copytree(scene, tmp_path / "workspace" / "small")
+    return tmp_path / "workspace"
+
+
+def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engine(browser, scene, workspace):
+    project = workspace / "small"
+    shutil.rmtree(project / "results")
+    port = free_port()
+    with serving(workspace, port) as address, watched(browser, address) as page:
+        page.goto(f"{address}/p/small/track")
+        page.get_by_role("button", name="Start").click()
+        page.wait_for_function("() => parseInt(document.querySelector('.figures .value')?.textContent) > 5")
+        page.get_by_role("button", name="Cancel").click()
+        expect(page.get_by_role("button", name="Resume")).to_be_visible()
+    kept = ask_kept(workspace, port)
+    assert 5 < kept < 240
+    with serving(workspace, port) as address, watched(browser, address) as page:
+        page.goto(f"{address}/p/small/track")
+        expect(page.locator(".note.info")).to_contain_text(f"{kept} of 240 frames")
+        page.keyboard.press("r")
+        expect(page.get_by_role("link", name="Review the result")).to_be_visible(timeout=60_000)
+        page.goto(f"{address}/p/small/export")
+        with page.expect_download() as download:
+            page.keyboard.press("d")
+        assert download.value.suggested_filename == "roof.csv"
+        downloaded = Path(download.value.path()).read_bytes()
+    assert downloaded == (scene / "results" / "roof.csv").read_bytes()
+
+
+def ask_kept(workspace: Path, port: int) -> int:
+    """Frames the engine kept, told by a server that starts anew."""
+    with serving(workspace, port) as address:
+        return int(ask(address, "projects/small/track")["frames_done"])
+
+
+def at_rest(page: Page, frame: int) -> None:
+    """Wait until a frame is on the screen with all its pixels."""
+    page.wait_for_selector(f'.review-frame[data-frame="{frame}"]')
+    page.wait_for_timeout(250)
+
+
+@pytest.mark.parametrize("ratio", [1, 2])
+@pytest.mark.parametrize("zooms", [0, 3])
+def test_the_overlay_lies_where_the_engine_measured(browser, workspace, ratio, zooms):
+    with serving(workspace, free_port()) as address, watched(browser, address, device_scale_factor=ratio) as page:
+        page.goto(f"{address}/p/small/review?frame={FRAME}&hidden=rejected,bands,edges")
+        at_rest(page, FRAME)
+        page.locator(".review-frame").focus()
+        for _ in range(zooms):
+            page.keyboard.press("+")
+        page.wait_for_timeout(200)
+        measured = ask(address, f"projects/small/review/{FRAME}")
+        to_canvas = placed_by(page, (960, 540), 1.4**zooms)
+        marks_agree(page, measured["targets"]["roof"], to_canvas)
+        features_agree(page, np.array(measured["ground"]["used"]), to_canvas, ratio)
+
+
+def placed_by(page: Page, video, zoom):
+    """The rule of the pixel's centre, written down again: (0, 0) is half a pixel inside the picture's corner."""
+    box = page.locator(".review-frame").bounding_box()
+    size = np.array([box["width"], box["height"]])
+    scale = zoom * min(size / np.array(video))
+    return lambda raw: scale * (np.asarray(raw, dtype=float) + 0.5 - np.array(video) / 2) + size / 2
+
+
+def marks_agree(page: Page, roof, to_canvas):
+    """P1, P2 and the ends of the fitted lines, in SVG."""
+    for name in ("p1", "p2"):
+        drawn = page.evaluate(
+            """(id) => {
+                const pane = document.querySelector(".review-frame").getBoundingClientRect();
+                const mark = document.querySelector(`[data-id="${id}"] .ink`).getBoundingClientRect();
+                return [mark.left + mark.width / 2 - pane.left, mark.top + mark.height / 2 - pane.top];
+            }""",
+            f"roof/{name}",
+        )
+        assert np.hypot(*(drawn - to_canvas(roof[f"{name}_raw"]))) < WITHIN_PX
+    for name, ends in roof["lines_raw"].items():
+        path = page.locator(f'[data-id="roof/line/{name}"] .ink').get_attribute("d")
+        drawn = np.array(re.findall(r"-?\d+\.?\d*", path), dtype=float).reshape(-1, 2)
+        assert np.abs(drawn - to_canvas(ends)).max() < WITHIN_PX
+
+
+def features_agree(page: Page, used, to_canvas, ratio):
+    """Rings around ground features, on the canvas: the middle of the coloured pixels."""
+    places = to_canvas(used)
+    gaps = np.linalg.norm(places[:, None] - places[None], axis=2) + 99 * np.eye(len(places))
+    box = page.locator(".review-frame").bounding_box()
+    inside = np.all((places > 20) & (places < [box["width"] - 20, box["height"] - 20]), axis=1)
+    alone = places[inside & (gaps.min(axis=1) > 24)][:40]
+    assert len(alone) >= 8
+    middles = page.evaluate(
+        """([places, ratio]) => {
+            const context = document.querySelector(".review-frame canvas.pixels").getContext("2d");
+            const half = Math.round(8 * ratio);
+            return places.map(([x, y]) => {
+                const left = Math.round(x * ratio) - half, top = Math.round(y * ratio) - half;
+                const { data, width, height } = context.getImageData(left, top, 2 * half, 2 * half);
+                let sum = 0, across = 0, down = 0;
+                for (let j = 0; j < height; j++) for (let i = 0; i < width; i++) {
+                    const k = 4 * (j * width + i), green = Math.max(0, data[k + 1] - data[k] - 60);
+                    sum += green; across += green * (i + 0.5); down += green * (j + 0.5);
+                }
+                return [(left + across / sum) / ratio, (top + down / sum) / ratio];
+            });
+        }""",
+        [alone.tolist(), ratio],
+    )
+    assert np.abs(np.array(middles) - alone).max() < WITHIN_PX
+
+
+def test_the_next_frame_comes_quickly_and_the_plot_and_player_lead_each_other(browser, workspace):
+    with serving(workspace, free_port()) as address, watched(browser, address) as page:
+        page.goto(f"{address}/p/small/review?frame={FRAME}")
+        at_rest(page, FRAME)
+        steps_ms = []
+        for frame in range(FRAME + 1, FRAME + 9):
+            page.wait_for_timeout(150)
+            steps_ms.append(page.evaluate(TIMED_STEP, frame))
+        assert np.median(steps_ms) < 150, steps_ms
+        history = ask(address, "projects/small/results/roof")
+        area = page.locator(".review-plots .u-over").first.bounding_box()
+        page.mouse.click(area["x"] + 0.25 * area["width"], area["y"] + 30)
+        times = history["time_s"]
+        expected = int(np.argmin(np.abs(np.array(times) - (times[0] + 0.25 * (times[-1] - times[0])))))
+        shown = int(re.search(r"frame=(\d+)", wait_for_url(page, r"frame=\d+")).group(1))
+        assert abs(shown - expected) <= 1
+        at_rest(page, shown)
+        expect(page.locator(".facts-table tbody tr").first).to_contain_text(
+            f"{1000 * history['p1_dx_m'][shown]:.1f}".replace("-", "−")
+        )
+
+
+TIMED_STEP = """(frame) => new Promise((resolve) => {
+    const element = document.querySelector(".review-frame");
+    const start = performance.now();
+    new MutationObserver((_, observer) => {
+        if (element.dataset.frame !== String(frame)) return;
+        observer.disconnect();
+        resolve(performance.now() - start);
+    }).observe(element, { attributes: true });
+    document.body.dispatchEvent(new KeyboardEvent("keydown", { key: ".", bubbles: true }));
+})"""
+
+
+def wait_for_url(page: Page, pattern: str) -> str:
+    page.wait_for_timeout(400)  # the address follows after a fifth of a second
+    assert re.search(pattern, page.url)
+    return page.url
+
+
+def test_frames_drawn_over_are_excluded_and_come_back_with_undo(browser, workspace):
+    with serving(workspace, free_port()) as address, watched(browser, address) as page:
+        page.goto(f"{address}/p/small/review?frame=30")
+        at_rest(page, 30)
+        area = page.locator(".review-plots .u-over").first.bounding_box()
+        page.keyboard.down("Shift")
+        page.mouse.move(area["x"] + 0.5 * area["width"], area["y"] + 40)
+        page.mouse.down()
+        page.mouse.move(area["x"] + 0.6 * area["width"], area["y"] + 40, steps=4)
+        page.mouse.up()
+        page.keyboard.up("Shift")
+        with page.expect_response(re.compile(r"/results/roof")):
+            page.keyboard.press("x")
+        (first, last) = read_project(workspace / "small").excluded_frames[0]
+        assert first == pytest.approx(0.5 * 239, abs=2)
+        assert last == pytest.approx(0.6 * 239, abs=2)
+        history = read_history_csv(workspace / "small" / "results" / "roof.csv")
+        assert set(history.status[first : last + 1].tolist()) == {"excluded"}
+        assert "excluded" not in history.status[:first].tolist()
+        expect(page.get_by_label("Excluded frames", exact=True)).to_contain_text(f"{first}–{last}")
+        page.reload()
+        at_rest(page, 30)
+        page.keyboard.press("Control+z")
+        expect(page.get_by_label("Excluded frames", exact=True)).to_contain_text("None")
+        assert read_project(workspace / "small").excluded_frames == ()
+
+
+def test_the_corner_slider_shows_what_the_engine_filters(browser, workspace):
+    history = read_history_csv(workspace / "small" / "results" / "roof.csv")
+    with serving(workspace, free_port()) as address, watched(browser, address) as page:
+        page.goto(f"{address}/p/small/drift")
+        expect(page.locator(".drift-lower .plot-legend").first).to_contain_text("East")
+        before = read_project(workspace / "small").drift.corner_hz
+        slider = page.get_by_role("slider", name="Corner frequency")
+        slider.focus()
+        answers = []
+        for _ in range(4):
+            with page.expect_response(lambda answer: answer.url.endswith("/drift")) as asked:
+                slider.press("ArrowRight")
+            answers.append(asked.value)
+        corner = json.loads(answers[-1].request.post_data)["corner_hz"]
+        assert corner == pytest.approx(before + 4 * 0.005)
+        answer = answers[-1].json()
+        expected = high_pass(history.p1_raw_m, history.time_s, corner)
+        drawn = np.array([answer["filtered"]["dx"], answer["filtered"]["dy"]], dtype=float).T
+        np.testing.assert_allclose(drawn, expected, atol=1e-6)
+        shown = hovered_value(page, "Filtered")
+        assert np.nanmin(np.abs(1000 * expected[:, 0] - shown)) < 0.06
+        page.wait_for_function("() => document.querySelector('.save-state').dataset.state === 'saved'")
+        expect(page.locator(".warnings")).not_to_be_empty()
+        assert read_project(workspace / "small").drift.corner_hz == pytest.approx(corner)
+
+
+def hovered_value(page: Page, label: str) -> float:
+    """Millimetres a curve shows under the pointer, in the middle of the history."""
+    area = page.locator(".drift-main .u-over").bounding_box()
+    page.mouse.move(area["x"] + 0.5 * area["width"], area["y"] + 0.5 * area["height"])
+    words = page.locator(".drift-main .plot-entry", has_text=label).locator("output")
+    expect(words).not_to_be_empty()
+    number, unit = words.inner_text().replace("−", "-").split(" ")
+    return float(number) * {"mm": 1, "cm": 10}[unit]
+
+
+def test_the_interval_of_rest_is_dragged_on_the_plot(browser, workspace):
+    with serving(workspace, free_port()) as address, watched(browser, address) as page:
+        page.goto(f"{address}/p/small/drift")
+        area = page.locator(".drift-main .u-over").bounding_box()
+        with page.expect_response(re.compile(r"/drift/sweep")):
+            page.mouse.move(area["x"] + 0.05 * area["width"], area["y"] + 60)
+            page.mouse.down()
+            page.mouse.move(area["x"] + 0.3 * area["width"], area["y"] + 60, steps=5)
+            page.mouse.up()
+        page.wait_for_function("() => document.querySelector('.save-state').dataset.state === 'saved'")
+        duration = 239 / 30
+        start, end = read_project(workspace / "small").intervals_s.pre_event
+        assert (start, end) == (pytest.approx(0.05 * duration, abs=0.03), pytest.approx(0.3 * duration, abs=0.03))
+        handle = page.get_by_role("slider", name="End of pre-event")
+        handle.focus()
+        with page.expect_response(re.compile(r"/drift/sweep")):
+            handle.press("Shift+ArrowLeft")
+        assert read_project(workspace / "small").intervals_s.pre_event[1] == pytest.approx(end - 1, abs=0.002)
+
+
+def test_table_2_says_what_the_summary_says(browser, workspace):
+    gps = json.loads((workspace / "small" / "results" / "summary.json").read_text())["targets"]["roof"]["gps"]
+    with serving(workspace, free_port()) as address, watched(browser, address) as page:
+        page.goto(f"{address}/p/small/export")
+        row = page.locator(".comparison tbody tr").first
+        expect(row).to_contain_text("East")
+        cells = [cell.replace("−", "-") for cell in row.locator("td").all_inner_texts()]
+        for quantity, (video, reference, error) in zip(
+            ("peak_positive_m", "peak_negative_m", "residual_m"), zip(*[iter(cells)] * 3, strict=True), strict=True
+        ):
+            told = gps[quantity]["x"]
+            for shown, exact in (
+                (video, told["video"]),
+                (reference, told["gps"]),
+                (error.split(" ")[0], told["error"]),
+            ):
+                assert float(shown) == pytest.approx(100 * exact, abs=0.0051)
+        expect(page.get_by_label("GPS", exact=True)).to_contain_text(f"{1000 * gps['rms_m']['x']:.1f}")
