@@ -1,7 +1,5 @@
 // A picture and its halved copies, so that a zoomed-out pane draws few pixels and does not shimmer.
 
-/** @typedef {import("../lib/types.js").Point} Point */
-
 const SMALLEST_LEVEL_PX = 700;
 
 export class PaneImage {
@@ -41,8 +39,7 @@ export class PaneImage {
   level(deviceScale) {
     let index = 0;
     while (index + 1 < this.levels.length && deviceScale * 2 ** (index + 1) <= 1.01) index += 1;
-    const bitmap = this.levels[index];
-    return { bitmap, shrink: /** @type {Point} */ ([this.width / bitmap.width, this.height / bitmap.height]) };
+    return this.levels[index];
   }
 }
 

@@ -52,7 +52,7 @@ export class Pane extends Emitter {
     this.view = new View();
     /** @type {PaneImage | null} */
     this.image = null;
-    /** @type {PaneImage | null} same pixel grid as the image, drawn over it */
+    /** @type {PaneImage | null} same extent as the image (its pixels may be larger), drawn over it */
     this.overlay = null;
     /** @type {{mode: "blend" | "swipe", amount: number}} how much of the overlay shows, 0 to 1 */
     this.mix = { mode: "blend", amount: 0.5 };
@@ -127,7 +127,15 @@ export class Pane extends Emitter {
     this.setView(this.view.centredOn(point, this.size, scale));
   }
 
-  /** Zoom at the pointer, or at the middle. @param {number} factor */
+  /** Show a few places with room around them. @param {Point[]} points image px */
+  lookAtAll(points) {
+    const [u, v] = [points.map((point) => point[0]), points.map((point) => point[1])];
+    const span = [Math.max(...u) - Math.min(...u), Math.max(...v) - Math.min(...v)];
+    const scale = Math.min(this.size[0] / (span[0] * 1.5 + 40), this.size[1] / (span[1] * 1.5 + 40));
+    this.lookAt([(Math.max(...u) + Math.min(...u)) / 2, (Math.max(...v) + Math.min(...v)) / 2], scale);
+  }
+
+  /** Zoom at the middle. @param {number} factor */
   zoom(factor) {
     this.setView(this.view.zoomedAt([this.size[0] / 2, this.size[1] / 2], factor));
   }
@@ -167,12 +175,12 @@ export class Pane extends Emitter {
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.clearRect(0, 0, this.canvas.width, this.canvas.height);
     if (this.image !== null) this.#drawImages(context, ratio);
-    for (const painter of this.#painters) {
+    for (const painter of this.image === null ? [] : this.#painters) {
       context.setTransform(ratio, 0, 0, ratio, 0, 0);
       context.globalAlpha = 1;
       painter(context, this.view);
     }
-    this.#layer.draw(this.#shapes, this.view, this.#hot);
+    this.#layer.draw(this.image === null ? [] : this.#shapes, this.view, this.#hot);
   }
 
   /** @param {CanvasRenderingContext2D} context @param {number} ratio */
@@ -193,9 +201,10 @@ export class Pane extends Emitter {
 
   /** @param {CanvasRenderingContext2D} context @param {number} ratio @param {PaneImage} image */
   #drawImage(context, ratio, image) {
-    const { bitmap, shrink } = image.level(this.view.scale * ratio);
+    const base = /** @type {PaneImage} */ (this.image);
+    const bitmap = image.level((this.view.scale * ratio * base.width) / image.width);
     context.imageSmoothingEnabled = this.view.scale * ratio < TRUE_PIXELS_FROM;
-    this.view.applyTo(context, ratio, shrink);
+    this.view.applyTo(context, ratio, [base.width / bitmap.width, base.height / bitmap.height]);
     context.drawImage(bitmap, 0, 0);
   }
 

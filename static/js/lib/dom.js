@@ -52,7 +52,7 @@ export function fill(element, ...children) {
 
 /**
  * The element a page must have; its absence is our mistake, so it throws.
- * @template {Element} Kind
+ * @template {Element} [Kind=HTMLElement]
  * @param {string} selector
  * @param {new () => Kind} [kind]
  * @param {ParentNode} [root]

@@ -90,7 +90,7 @@ const askFit = latest(
 async function findGhosts() {
   for (const side of sides) {
     const halves = fit.state === "ok" ? halvesWithout(slots, side.side) : [];
-    const from = side === frame ? "world" : "raw";
+    const from = side === frame ? "plan" : "raw";
     const to = side === frame ? frameName() : "ortho";
     try {
       const points = await transform(from, to, halves.map((half) => /** @type {Point} */ (half[otherSide(side.side)])));
@@ -296,6 +296,7 @@ const loadImage = (path, side) => PaneImage.load(`/api/${path}`, { onLevel: () =
 
 async function loadFrame() {
   const wanted = undistorted;
+  if (frame.pane.image === null) frame.chrome.setNote("Loading the frame…");
   try {
     const image = await loadImage(projectPath(page.id, `frames/${store.project.reference_frame}.jpg`, { und: wanted ? 1 : 0 }), frame);
     if (wanted !== undistorted) return;
@@ -313,6 +314,7 @@ async function loadFrame() {
 }
 
 async function loadOrtho() {
+  if (ortho.pane.image === null) ortho.chrome.setNote("Loading the orthoimage…");
   try {
     const answer = await get(projectPath(page.id, "orthoimage"));
     grid = answer.grid;

@@ -1,0 +1,101 @@
+// Step 1: the files measured from, and what was understood of each.
+
+import { get, projectPath } from "../lib/api.js";
+import { fill, find, h } from "../lib/dom.js";
+import { icon } from "../lib/icons.js";
+import { stepUrl } from "../components/header.js";
+import { isRunning, jobCard } from "../components/job-card.js";
+import { openPage } from "../components/page.js";
+import { toast, toastError } from "../components/toast.js";
+import { calibrationDialog, calibrationReport } from "./inputs/calibration.js";
+import { gpsSettings } from "./inputs/gps-settings.js";
+import { inputCard } from "./inputs/input-card.js";
+
+/** @typedef {import("./inputs/input-card.js").InputKind} InputKind */
+/** @typedef {import("../lib/types.js").Project} Project */
+
+const page = await openPage("inputs");
+const { store } = page;
+
+/** @param {Project} draft @param {InputKind} kind @param {string | null} path */
+function setInput(draft, kind, path) {
+  if (kind === "video") draft.inputs.video = path ?? "";
+  else if (kind === "gps") draft.inputs.gps = path === null ? null : { time: "time_s", x: "east_m", y: "north_m", at_m: null, ...draft.inputs.gps, file: path };
+  else draft.inputs[kind] = path;
+}
+
+const KINDS = /** @type {const} */ ([
+  { kind: "video", title: "Video", glyph: "video", accept: "video/*", why: "A drone video of the structure from above, ground around it in view." },
+  { kind: "cloud", title: "Point cloud", glyph: "cube", accept: ".las,.laz,.ply,.pcd,.xyz,.pts,.csv,.e57", why: "A LiDAR cloud of the site: it ties the picture to metres and gives the roof's height." },
+  { kind: "lens", title: "Lens", glyph: "target", accept: ".yaml,.yml,.xml", why: "Interior orientation of the camera. Calibrate it here from pictures of a checkerboard." },
+  { kind: "gps", title: "GPS", glyph: "clock", accept: ".csv", why: "Optional: a GPS record on the roof, to compare the result with." },
+]);
+
+const calibrate = h("button", { class: "button small", type: "button", onclick: () => void calibrationDialog(page.id).catch(toastError) }, icon("target", "small"), "Calibrate…");
+const columns = h("button", { class: "button small", type: "button", onclick: () => void gpsSettings(store).catch(toastError) }, icon("edit", "small"), "Columns…");
+/** @type {Partial<Record<InputKind, Node[]>>} */
+const FURTHER = { lens: [calibrate], gps: [columns] };
+const cards = new Map(
+  KINDS.map((entry) => [
+    entry.kind,
+    inputCard({
+      ...entry,
+      projectId: page.id,
+      onPath: (path) => store.edit(`Choose ${entry.title.toLowerCase()}`, (draft) => setInput(draft, entry.kind, path)),
+      onChange: () => void store.refresh().catch(toastError),
+      onRemove: entry.kind === "video" ? null : () => store.edit(`Remove ${entry.title.toLowerCase()}`, (draft) => setInput(draft, entry.kind, null)),
+      more: FURTHER[entry.kind],
+    }),
+  ]),
+);
+const job = jobCard();
+const report = calibrationReport(page.id);
+const problems = h("div", { class: "problems" });
+const next = h("a", { class: "button primary", href: stepUrl(page.id, "orthoimage") }, "Orthoimage & 3D", icon("arrow_right", "small"));
+fill(
+  find("#main"),
+  h("div", { class: "page-title" }, h("div", {}, h("h1", {}, "Inputs"), h("p", {}, "Choose files on this computer, or drop and send them from anywhere. Each is read at once; what was understood stands beside it.")), next),
+  problems,
+  h("div", { class: "card-grid" }, [...cards.values()].map((card) => card.element)),
+  job.element,
+  report.element,
+);
+
+async function load() {
+  try {
+    const facts = await get(projectPath(page.id, "inputs"));
+    for (const [kind, card] of cards) card.show(facts[kind]);
+    columns.hidden = facts.gps === null;
+  } catch (error) {
+    toastError(error);
+  }
+}
+
+/** Only what concerns the files themselves: later steps tell their own. */
+function showProblems() {
+  const own = (store.state.problems ?? []).filter((problem) => problem.startsWith("inputs"));
+  fill(problems, own.map((problem) => h("p", { class: "note warn" }, icon("warn"), h("span", {}, problem))));
+}
+
+/** @param {import("../lib/types.js").Job | null} running */
+function showJob(running) {
+  if (running === null || !["calibrate", "cloud"].includes(running.kind)) return;
+  job.show(running);
+  calibrate.disabled = isRunning(running);
+  if (running.kind === "calibrate" && running.state === "done") {
+    toast("The lens is calibrated and in use.", { tone: "good" });
+    void report.refresh();
+  }
+  if (running.state === "done") void load();
+}
+
+store.on("change", ({ project, previous, origin }) => {
+  showProblems();
+  if (origin !== "edit" && JSON.stringify(project.inputs) !== JSON.stringify(previous.inputs)) void load();
+  if (origin === "saved") void load();
+});
+page.events.on("inputs", () => void load());
+page.events.on("job", showJob);
+page.events.on("hello", ({ job: running }) => showJob(running));
+showProblems();
+await Promise.all([load(), report.refresh()]);

@@ -1,0 +1,51 @@
+// A new project: its name, and the files it starts from, by their place on this computer or sent by the browser.
+
+import { post, sentence } from "../../lib/api.js";
+import { h } from "../../lib/dom.js";
+import { icon } from "../../lib/icons.js";
+import { dialogActions, openDialog } from "../../components/dialog.js";
+import { chooseFiles } from "../../components/file-browser.js";
+
+const INPUTS = /** @type {const} */ ([
+  { kind: "video", name: "Video", hint: "mp4, mov, mkv" },
+  { kind: "cloud", name: "Point cloud", hint: "laz, las, ply, pcd, e57, csv" },
+  { kind: "lens", name: "Lens", hint: "yaml from a checkerboard; can be calibrated later" },
+  { kind: "gps", name: "GPS", hint: "csv, to compare with" },
+]);
+
+/** @returns {Promise<string | null>} id of the project made */
+export function newProjectDialog() {
+  return openDialog({
+    title: "New project",
+    body: (close) => {
+      const name = h("input", { class: "input", id: "project-name", type: "text", required: true, placeholder: "EQ7", autocomplete: "off", spellcheck: "false", autofocus: true });
+      const problem = h("p", { class: "note bad", role: "alert", hidden: true });
+      /** @type {Record<string, string>} */
+      const chosen = {};
+      const rows = INPUTS.map(({ kind, name: title, hint }) => {
+        const path = h("span", { class: "path soft" }, hint);
+        const choose = async () => {
+          const files = await chooseFiles({ title: `Choose the ${title.toLowerCase()}`, kind });
+          if (files === null) return;
+          chosen[kind] = files[0];
+          path.textContent = files[0];
+          path.className = "path";
+          if (name.value === "" && kind === "video") name.value = files[0].split("/").at(-1)?.replace(/\.[^.]+$/, "") ?? "";
+        };
+        return h("div", { class: "file-row", "data-kind": kind }, h("span", { class: "label" }, title), path, h("button", { class: "button small", type: "button", onclick: () => void choose() }, icon("folder", "small"), "Browse…"));
+      });
+      const submit = async (/** @type {Event} */ event) => {
+        event.preventDefault();
+        try {
+          close((await post("projects", { name: name.value.trim(), ...chosen })).id);
+        } catch (error) {
+          problem.hidden = false;
+          problem.textContent = sentence(error);
+        }
+      };
+      const field = h("div", { class: "field" }, h("label", { class: "label", for: "project-name" }, "Name"), name);
+      const files = h("div", { class: "file-rows" }, rows, h("p", { class: "small faint" }, "Files stay where they are. All of them can be chosen, sent or changed later, in step 1."));
+      return [h("form", { class: "dialog-form", onsubmit: submit }, h("div", { class: "dialog-body" }, field, files, problem), dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, "Create")))];
+    },
+  });
+}

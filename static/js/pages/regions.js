@@ -1,0 +1,275 @@
+// Step 4: what moves (polygons on the raw frame), and what is measured (bands or a region on the orthorectified frame).
+
+import { get, post, projectPath, sentence } from "../lib/api.js";
+import { orthoFromWorld, worldFromOrtho } from "../lib/coordinates.js";
+import { fill, find, h } from "../lib/dom.js";
+import { fixed, plural } from "../lib/format.js";
+import { icon } from "../lib/icons.js";
+import { latest } from "../lib/latest.js";
+import { Targets, isComplete } from "../lib/targets.js";
+import { setView, viewText } from "../lib/view-state.js";
+import { Loupe } from "../components/loupe.js";
+import { Pane } from "../components/pane.js";
+import { paneChrome } from "../components/pane-chrome.js";
+import { PaneImage } from "../components/pane-image.js";
+import { nudgeKeys, paneKeys } from "../components/pane-keys.js";
+import { openPage } from "../components/page.js";
+import { PolygonEditor } from "../components/polygon-editor.js";
+import { toastError } from "../components/toast.js";
+import { BandEditor } from "./regions/band-editor.js";
+import { cornersOf } from "./regions/band.js";
+import { bandsPanel } from "./regions/bands-panel.js";
+import { edgePainter, previewShapes } from "./regions/preview.js";
+import { targetsPanel } from "./regions/targets-panel.js";
+
+/** @typedef {import("../lib/types.js").Point} Point */
+/** @typedef {import("../lib/types.js").OrthoGrid} OrthoGrid */
+/** @typedef {import("../lib/targets.js").OpenTarget} OpenTarget */
+/** @typedef {import("./regions/preview.js").Preview} Preview */
+
+const WIDTH_STEP_M = 0.02;
+const TURN_STEP_RAD = (0.2 * Math.PI) / 180;
+
+const page = await openPage("regions");
+const { store } = page;
+const targets = new Targets(store);
+const wanted = viewText("target");
+if (wanted !== null) targets.select(wanted);
+
+/** @type {OrthoGrid} */
+let grid = { west_m: 0, north_m: 0, pixel_size_m: 0.01, width: 0, height: 0 };
+/** @type {Preview | null} */
+let preview = null;
+
+const toPixels = (/** @type {Point} */ plan) => orthoFromWorld(grid, plan);
+const toPlan = (/** @type {Point} */ pixels) => worldFromOrtho(grid, pixels);
+const same = (/** @type {Point} */ point) => point;
+
+// --- panes
+
+const framePane = new Pane(find("#frame"), { label: "Reference frame. Clicks draw the outline of what moves." });
+const planPane = new Pane(find("#plan"), { label: "Orthorectified reference frame. Clicks draw the search bands of the chosen target." });
+const panes = [framePane, planPane];
+const loupes = panes.map((pane) => new Loupe(pane));
+const frameChrome = paneChrome(framePane, { title: "Reference frame · raw", readout: ([u, v]) => [`${fixed(u, 1)}, ${fixed(v, 1)} px`] });
+const planChrome = paneChrome(planPane, { title: "Orthorectified frame", readout: (point) => [`${toPlan(point).map((value) => fixed(value, 2)).join(", ")} m`] });
+
+const moving = new PolygonEditor(framePane, {
+  prefix: "moving",
+  look: "moving",
+  noun: "moving region",
+  polygons: () => store.project.moving_regions_px,
+  save: (label, polygons, merge) => void store.edit(label, (draft) => void (draft.moving_regions_px = polygons.map(tenths)), { merge }),
+  accepts: () => framePane.image !== null,
+});
+/** @type {PolygonEditor} */
+const region = new PolygonEditor(planPane, {
+  prefix: "region",
+  look: "corner-point",
+  noun: "region",
+  polygons: () => (targets.selected?.kind === "points" && targets.selected.region_m ? [targets.selected.region_m.map(toPixels)] : []),
+  save: (label, polygons, merge) => changeSelected(label, (target) => void (target.region_m = polygons[0]?.map(toPlan).map(millimetres) ?? target.region_m), merge),
+  accepts: () => planPane.image !== null && targets.selected?.kind === "points" && (region.isDrawing || targets.selected.region_m === null),
+  single: true,
+});
+const bands = new BandEditor(planPane, {
+  bands: () => (targets.selected?.kind === "lines" ? (targets.selected.lines ?? {}) : {}),
+  save: (line, band, label, merge) => saveBand(line, band, label, merge),
+  accepts: () => planPane.image !== null && targets.selected?.kind !== "points",
+  toPixels,
+  toPlan,
+});
+
+/** @param {import("../lib/types.js").LineName} line @param {import("../lib/types.js").Band} band @param {string} label @param {boolean} merge */
+function saveBand(line, band, label, merge) {
+  if (targets.selected === null) targets.add("lines");
+  changeSelected(label, (target) => void (target.lines = { ...target.lines, [line]: band }), merge);
+}
+
+/** @param {string} label @param {(target: OpenTarget) => void} change @param {boolean} [merge] */
+function changeSelected(label, change, merge = false) {
+  const { selected } = targets;
+  if (selected !== null) targets.change(selected.name, `${label} of ${selected.name}`, change, { merge });
+}
+
+/** Tenths of a pixel, thousandths of a metre: what is stored. @param {Point[]} points @returns {Point[]} */
+const tenths = (points) => points.map(([u, v]) => [Math.round(u * 10) / 10, Math.round(v * 10) / 10]);
+/** @param {Point} point @returns {Point} */
+const millimetres = ([x, y]) => [Math.round(x * 1000) / 1000, Math.round(y * 1000) / 1000];
+
+framePane.addPainter(edgePainter(() => preview, "raw", same));
+planPane.addPainter(edgePainter(() => preview, "plan", toPixels));
+
+// --- panels
+
+const showTargets = targetsPanel(find("#targets"), targets);
+const showBands = bandsPanel(find("#bands"), bands, (line, band) => saveBand(line, band, `Number of ${line}`, true));
+const movingList = h("ul", { class: "target-list" });
+fill(find("#moving"), h("header", {}, h("h2", {}, "Moving regions")), movingList);
+
+function showMoving() {
+  const regions = store.project.moving_regions_px;
+  const row = (/** @type {Point[]} */ corners, /** @type {number} */ i) => {
+    const remove = () => void store.edit("Delete moving region", (draft) => void draft.moving_regions_px.splice(i, 1));
+    return h(
+      "li",
+      { "aria-selected": String(moving.selected?.polygon === i) },
+      h("span", { class: "swatch moving" }),
+      h("button", { class: "name plain", type: "button", onclick: () => moving.select(i) }, `Region ${i + 1}`),
+      h("span", { class: "badge" }, plural(corners.length, "corner")),
+      h("button", { class: "button quiet small icon-only", type: "button", "aria-label": `Delete region ${i + 1}`, onclick: remove }, icon("trash")),
+    );
+  };
+  const none = h("li", { class: "none" }, "Outline everything that moves: building, table, its shadow. Nothing inside is used to follow the camera.");
+  fill(movingList, regions.length === 0 ? none : regions.map(row));
+}
+
+// --- drawing and preview
+
+function draw() {
+  framePane.setShapes([...moving.shapes(), ...previewShapes(preview, "raw", same)]);
+  const isPoints = targets.selected?.kind === "points";
+  planPane.setShapes([...(isPoints ? region.shapes() : bands.shapes()), ...previewShapes(preview, "plan", toPixels)]);
+  frameChrome.setHint(moving.isDrawing ? (moving.draft.length < 3 ? "Click the next corner" : "Enter or a double click closes") : "");
+  planChrome.setHint(planHint());
+  find("#bands").hidden = isPoints;
+  showBands(preview);
+  showMoving();
+}
+
+function planHint() {
+  const { selected } = targets;
+  if (planPane.image === null) return "";
+  if (selected?.kind === "points") return region.isDrawing ? (region.draft.length < 3 ? "Click the next corner" : "Enter or a double click closes") : selected.region_m === null ? `Click the corners of ${selected.name}` : "";
+  const line = bands.nextLine;
+  return line === null ? "" : `${line}: ${["click one end", "click the other end", "click at half the width"][bands.draft.length]}`;
+}
+
+const askPreview = latest(
+  (/** @type {OpenTarget} */ target) => post(projectPath(page.id, "lines/preview"), { target }),
+  (answer) => {
+    preview = answer;
+    draw();
+  },
+  (error) => {
+    preview = { lines: {}, p1: null, p2: null, message: sentence(error) };
+    draw();
+  },
+);
+
+/** @param {OpenTarget | null} [target] as it stands while dragging */
+function refreshPreview(target = targets.selected) {
+  if (target !== null && isComplete(target) && planPane.image !== null) return askPreview(target);
+  preview = null;
+  draw();
+}
+
+bands.on("moving", (live) => targets.selected !== null && refreshPreview({ ...targets.selected, lines: live }));
+for (const polygon of [moving, region]) polygon.on("change", draw);
+bands.on("change", draw);
+targets.on("change", () => {
+  showTargets();
+  setView({ target: targets.selected?.name ?? null });
+  draw();
+  refreshPreview();
+});
+
+// --- layout
+
+const layouts = /** @type {const} */ ([["both", "Both"], ["frame", "Frame"], ["plan", "Orthorectified"]]);
+/** @param {string} name */
+function setLayout(name) {
+  const chosen = layouts.some(([key]) => key === name) ? name : "both";
+  find("#panes").dataset.layout = chosen;
+  for (const button of find("#layout").querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.dataset.layout === chosen));
+  setView({ layout: chosen === "both" ? null : chosen });
+}
+
+function nextLayout() {
+  const at = layouts.findIndex(([key]) => key === find("#panes").dataset.layout);
+  setLayout(layouts[(at + 1) % layouts.length][0]);
+}
+
+find("#layout").append(...layouts.map(([key, words]) => h("button", { type: "button", "data-layout": key, onclick: () => setLayout(key) }, words)));
+setLayout(viewText("layout") ?? "both");
+
+// --- keys
+
+const editorOf = (/** @type {Pane} */ pane) => (pane === framePane ? moving : targets.selected?.kind === "points" ? region : bands);
+const focusedPane = () => panes.find((pane) => pane.hasFocus) ?? null;
+const focusedEditor = () => {
+  const pane = focusedPane();
+  return pane === null ? null : editorOf(pane);
+};
+const bandKeys = () => planPane.hasFocus && bands.selected !== null;
+page.keys([
+  { keys: "Click", group: "Placing", label: "Left: next corner of a moving region. Right: two clicks along a line, the third at half the width" },
+  { keys: "Drag", group: "Placing", label: "A corner, an edge, a band, its ends or its width. Elsewhere: pan" },
+  {
+    keys: "Enter",
+    group: "Placing",
+    label: "Close the outline; otherwise click in the middle (keyboard)",
+    when: () => focusedPane() !== null,
+    run(event) {
+      const editor = focusedEditor();
+      if (editor instanceof PolygonEditor && editor.draft.length >= 3) editor.close();
+      else focusedPane()?.clickCentre(event);
+    },
+  },
+  { keys: "Space", group: "Placing", label: "Click in the middle (keyboard)", when: () => focusedPane() !== null, run: (event) => focusedPane()?.clickCentre(event) },
+  { keys: "Escape", group: "Placing", label: "Take back the newest click; then select nothing", run: () => (focusedEditor() ?? bands).back() },
+  { keys: "Delete / Backspace", group: "Placing", label: "Delete the selected corner or region", when: () => focusedEditor() instanceof PolygonEditor, run: () => focusedEditor() instanceof PolygonEditor && /** @type {PolygonEditor} */ (focusedEditor()).remove() },
+  ...nudgeKeys(panes, { what: "what is selected", when: (pane) => editorOf(pane).selected !== null, nudge: (pane, delta) => editorOf(pane).nudge(delta) }),
+  { keys: "Ctrl+Z", group: "Placing", label: "Take back the newest click of an unfinished shape first", when: () => [moving, region, bands].some((editor) => editor.isDrawing), run: () => [moving, region, bands].find((editor) => editor.isDrawing)?.back() },
+  { keys: "[", group: "Bands", label: "Narrower by 2 cm", when: bandKeys, run: () => bands.widen(-WIDTH_STEP_M) },
+  { keys: "]", group: "Bands", label: "Wider by 2 cm", when: bandKeys, run: () => bands.widen(WIDTH_STEP_M) },
+  { keys: ",", group: "Bands", label: "Turn counter-clockwise by 0.2°", when: bandKeys, run: () => bands.turn(TURN_STEP_RAD) },
+  { keys: ".", group: "Bands", label: "Turn clockwise by 0.2°", when: bandKeys, run: () => bands.turn(-TURN_STEP_RAD) },
+  { keys: "Z", group: "Looking", label: "Loupe", run: () => loupes.forEach((loupe) => loupe.setEnabled(!loupe.enabled)) },
+  { keys: "V", group: "Looking", label: "Both pictures, the frame, the orthorectified frame", run: nextLayout },
+  ...paneKeys(panes, { canPan: () => focusedEditor()?.selected == null }),
+]);
+
+// --- pictures
+
+async function loadFrame() {
+  if (framePane.image === null) frameChrome.setNote("Loading the frame…");
+  try {
+    framePane.setImage(await PaneImage.load(`/api/${projectPath(page.id, `frames/${store.project.reference_frame}.jpg`)}`, { onLevel: () => framePane.invalidate() }));
+    frameChrome.setTitle(`Frame ${store.project.reference_frame} · raw`);
+    frameChrome.setNote();
+  } catch (error) {
+    frameChrome.setNote(sentence(error));
+  }
+}
+
+async function loadPlan() {
+  if (planPane.image === null) planChrome.setNote("Laying the frame on the ground…");
+  try {
+    const answer = await get(projectPath(page.id, "rectified"));
+    if (!answer.ready) {
+      planChrome.setNote(answer.message, h("a", { class: "button primary", href: `/p/${encodeURIComponent(page.id)}/correspondences` }, "Place correspondences"));
+      return;
+    }
+    grid = answer.grid;
+    planPane.setImage(await PaneImage.load(`/api/${projectPath(page.id, "rectified.jpg", { v: store.revision })}`, { onLevel: () => planPane.invalidate() }));
+    planChrome.setNote();
+    draw();
+    refreshPreview();
+  } catch (error) {
+    planChrome.setNote(sentence(error));
+  }
+}
+
+store.on("change", ({ project, previous }) => {
+  const rectifiedAnew = JSON.stringify([project.correspondences, project.orthoimage, project.inputs]) !== JSON.stringify([previous.correspondences, previous.orthoimage, previous.inputs]);
+  if (project.reference_frame !== previous.reference_frame) void loadFrame();
+  if (rectifiedAnew || project.reference_frame !== previous.reference_frame) void loadPlan().catch(toastError);
+});
+page.events.on("orthoimage", () => void loadPlan());
+
+showTargets();
+draw();
+await Promise.all([loadFrame(), loadPlan()]);
+const drawn = Object.values(bands.bands).flatMap(cornersOf).map(toPixels);
+if (drawn.length > 0 && planPane.image !== null) planPane.lookAtAll(drawn);

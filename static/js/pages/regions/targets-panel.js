@@ -1,0 +1,86 @@
+// What is measured: the list of targets, and the settings of the chosen one.
+
+import { fill, h } from "../../lib/dom.js";
+import { icon } from "../../lib/icons.js";
+import { metres } from "../../lib/format.js";
+import { TARGET_NAME, isComplete } from "../../lib/targets.js";
+import { askText } from "../../components/dialog.js";
+import { menuButton } from "../../components/menu.js";
+import { numberField } from "../../components/number-field.js";
+import { toast } from "../../components/toast.js";
+
+/** @typedef {import("../../lib/targets.js").Targets} Targets */
+/** @typedef {import("../../lib/targets.js").OpenTarget} OpenTarget */
+
+/** @param {HTMLElement} element @param {Targets} targets */
+export function targetsPanel(element, targets) {
+  const add = menuButton({
+    label: "Add target",
+    icon: "add",
+    items: () => [
+      { label: "Three lines (L1, L2, T1)", icon: "target", run: () => void targets.add("lines") },
+      { label: "Textured region", icon: "polygon", run: () => void targets.add("points") },
+    ],
+  });
+  const list = h("ul", { class: "target-list", role: "listbox", "aria-label": "Targets" });
+  const settings = h("div", { class: "settings" });
+  fill(element, h("header", {}, h("h2", {}, "Targets"), add), list, settings);
+
+  const change = (/** @type {string} */ what, /** @type {(target: OpenTarget) => void} */ edit) => {
+    const { selected } = targets;
+    if (selected !== null) targets.change(selected.name, `${what} of ${selected.name}`, edit);
+  };
+  const height = numberField({ label: "Height above ground", unit: "m", value: null, optional: true, step: 0.05, onChange: (value) => change("Height", (target) => void (target.height_m = value)) });
+  const apart = numberField({ label: "P1–P2 distance", unit: "m", value: null, decimals: 3, step: 0.01, min: 0.001, optional: true, onChange: (value) => change("P1–P2 distance", (target) => void (target.p1_p2_m = value)) });
+  const relative = h("select", { class: "input", id: "relative-to" });
+  relative.addEventListener("change", () => change("Reference", (target) => void (target.relative_to = relative.value || null)));
+  fill(
+    settings,
+    h("div", { class: "field-row" }, height.element, apart.element),
+    h("div", { class: "field" }, h("label", { class: "label", for: "relative-to" }, "Displacement relative to"), relative),
+  );
+
+  return function show() {
+    const { all, selected } = targets;
+    fill(list, all.map((target) => row(targets, target, target.name === selected?.name)));
+    if (all.length === 0) fill(list, h("li", { class: "none" }, "Nothing to measure yet. Add the roof, and the shake table if it is in view."));
+    settings.hidden = selected === null;
+    if (selected === null) return;
+    height.set(selected.height_m);
+    apart.set(selected.p1_p2_m);
+    const bases = all.filter((target) => target.name !== selected.name && target.relative_to === null && isComplete(target));
+    fill(relative, h("option", { value: "" }, "its own rest position"), bases.map((target) => h("option", { value: target.name }, target.name)));
+    relative.value = selected.relative_to ?? "";
+  };
+}
+
+/** @param {Targets} targets @param {OpenTarget} target @param {boolean} isSelected */
+function row(targets, target, isSelected) {
+  const state = isComplete(target) ? (target.height_m === null ? "no height" : metres(target.height_m)) : "drawing";
+  const choose = () => targets.select(target.name);
+  const more = menuButton({
+    label: `Actions for ${target.name}`,
+    icon: "more",
+    items: () => [
+      { label: "Rename…", icon: "edit", run: () => void rename(targets, target.name) },
+      { label: "Delete", icon: "trash", danger: true, run: () => targets.remove(target.name) },
+    ],
+  });
+  return h(
+    "li",
+    { role: "option", tabindex: 0, "aria-selected": String(isSelected), "data-target": target.name, onclick: choose, onkeydown: (/** @type {KeyboardEvent} */ event) => event.key === "Enter" && event.target === event.currentTarget && choose() },
+    icon(target.kind === "lines" ? "target" : "polygon"),
+    h("span", { class: "name" }, target.name),
+    h("span", { class: `badge ${isComplete(target) ? (target.height_m === null ? "warn" : "") : "accent"}` }, state),
+    more,
+  );
+}
+
+/** @param {Targets} targets @param {string} name */
+async function rename(targets, name) {
+  const wanted = await askText({ title: "Rename target", label: "Name", value: name, action: "Rename", hint: "Letters, digits, - and _. It names the result file." });
+  if (wanted === null || wanted === name) return;
+  if (!TARGET_NAME.test(wanted)) toast(`“${wanted}” cannot name a file: use letters, digits, - and _ only.`, { tone: "bad" });
+  else if (targets.all.some((target) => target.name === wanted)) toast(`There is already a target “${wanted}”.`, { tone: "bad" });
+  else targets.rename(name, wanted);
+}
