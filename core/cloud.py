@@ -388,11 +388,14 @@ def _horizontal_surfaces(cells: Floats) -> list[tuple[Floats, int]]:
         if len(left) < _min_cells(cells):
             break
         plane = _best_plane(left, random)
-        inside = np.abs(left[:, 2] - left[:, :2] @ plane[:2] - plane[2]) < _SLAB_M
-        count = int(np.count_nonzero(inside))
+        off = np.abs(left[:, 2] - left[:, :2] @ plane[:2] - plane[2])
+        inside = off < _SLAB_M
+        count, around = int(np.count_nonzero(inside)), int(np.count_nonzero(off < 3 * _SLAB_M))
         if count < _min_cells(cells):
             break
-        surfaces.append((plane, count))
+        # A cut through something thick has twice as much beside it as within; a surface has little.
+        if 2 * count >= around and np.hypot(plane[0], plane[1]) < np.tan(_MAX_TILT_RAD):
+            surfaces.append((plane, count))
         left = left[~inside]
     return surfaces
 
@@ -582,6 +585,10 @@ def _group_medians(values: Floats, owner: NDArray[np.int64]) -> Floats:
     return np.asarray(0.5 * (ordered[starts + (counts - 1) // 2] + ordered[starts + counts // 2]))
 
 
+# Thickness of the layer that is taken for one surface about a click.
+_CLICK_SLAB_M = 0.2
+
+
 def height_at(cloud: Cloud, plane: GroundPlane, xy: ArrayLike, radius_m: float = 0.3) -> tuple[float, float, int]:
     """Return height above the ground plane, its spread and the number of points of the upper surface at a place.
 
@@ -601,19 +608,26 @@ def height_at(cloud: Cloud, plane: GroundPlane, xy: ArrayLike, radius_m: float =
             f"only {len(near)} points of the cloud lie within {radius_m:g} m of ({xy[0]:.2f}, {xy[1]:.2f}); "
             "click where it is denser or take a larger radius."
         )
-    heights = np.sort(plane.height_of(cloud.select(near)))
-    slab = 0.2
-    inside = np.searchsorted(heights, heights, side="right") - np.searchsorted(heights, heights - slab)
-    # The highest slab that is more than a bird, a wire or a stretch of wall.
-    top = heights[np.flatnonzero(inside >= max(3, 0.15 * len(heights)))]
-    level = float(top[-1]) - slab / 2 if len(top) else float(np.median(heights))
+    heights = plane.height_of(cloud.select(near))
+    level = _upper_surface(heights, np.floor(offsets[near] / (radius_m / 4)).astype(np.int64) @ np.array([64, 1]))
     for _ in range(5):
-        surface = heights[np.abs(heights - level) <= slab / 2]
-        if not len(surface):
-            break
-        level = float(np.median(surface))
-    surface = heights[np.abs(heights - level) <= slab]
+        level = float(np.median(heights[np.abs(heights - level) <= _CLICK_SLAB_M / 2]))
+    surface = heights[np.abs(heights - level) <= _CLICK_SLAB_M]
     return level, float(surface.std()), len(surface)
+
+
+def _upper_surface(heights: Floats, cells: NDArray[np.int64]) -> float:
+    """Height of a point amid the highest layer that covers a fair part of the cells around a click.
+
+    Counted in cells, not in points: a wall below a roof's edge may hold most of the points, but stands on few cells,
+    and so does a wire; a bird holds one.
+    """
+    enough = max(2.0, 0.25 * len(np.unique(cells)))
+    for top in np.arange(heights.max(), heights.min(), -_CLICK_SLAB_M / 4):
+        layer = (heights <= top) & (heights > top - _CLICK_SLAB_M)
+        if len(np.unique(cells[layer])) >= enough:
+            return float(np.median(heights[layer]))
+    return float(np.sort(heights)[len(heights) // 2])
 
 
 def pick(cloud: Cloud, ray_origin_m: ArrayLike, ray_direction: ArrayLike, radius_m: float = 0.1) -> Floats | None:

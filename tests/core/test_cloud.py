@@ -1,0 +1,388 @@
+from __future__ import annotations
+
+import builtins
+import struct
+
+import laspy
+import numpy as np
+import pytest
+
+from core.cloud import (
+    Cloud,
+    fit_ground_plane,
+    ground_elevation,
+    height_at,
+    make_cloud,
+    pick,
+    read_cloud,
+    thin,
+)
+from core.errors import InputError
+
+# A UTM zone in Japan: in float32 the northing would come in steps of a quarter of a metre.
+ORIGIN = np.array([651_234.0, 3_872_345.0, 113.0])
+SLOPE = np.array([0.010, -0.005])
+ROOF_M = 18.3
+NOISE_M = 0.004
+
+
+def relief(xy: np.ndarray) -> np.ndarray:
+    """Ground of a few centimetres, waves of ten metres and more."""
+    return 0.04 * np.sin(xy[..., 0] / 2.1) * np.cos(xy[..., 1] / 1.7)
+
+
+def site(count: int = 200_000, seed: int = 0) -> Cloud:
+    """A building on uneven ground, scanned more densely near its middle; half of all points on roof and walls."""
+    random = np.random.default_rng(seed)
+    ground = random.uniform(-20, 20, (count // 2, 2)) * np.sqrt(random.uniform(0.15, 1, (count // 2, 1)))
+    ground = ground[(np.abs(ground) > [6, 4]).any(axis=1)]
+    roof = random.uniform((-6, -4), (6, 4), (count // 3, 2))
+    wall = random.uniform((-6, 0), (6, ROOF_M), (count // 6, 2))
+    ground_z = relief(ground) + ground @ SLOPE + random.normal(0, NOISE_M, len(ground))
+    roof_z = ROOF_M + random.normal(0, NOISE_M, len(roof))
+    points = np.concatenate(
+        [
+            np.column_stack([ground, ground_z]),
+            np.column_stack([roof, roof_z]),
+            np.column_stack([wall[:, 0], np.full(len(wall), 4.0), wall[:, 1]]),
+            # Stray echoes below the ground.
+            np.column_stack([random.uniform(-15, 15, (200, 2)), random.uniform(-6, -1, 200)]),
+        ]
+    )
+    return make_cloud(points + ORIGIN)
+
+
+@pytest.fixture(scope="module")
+def building() -> Cloud:
+    return site()
+
+
+SAMPLE = ORIGIN + np.random.default_rng(3).uniform(-10, 10, (500, 3)).round(3)
+COLOURS = np.random.default_rng(4).integers(0, 256, (500, 3)).astype(np.uint8)
+COLOURS_16_BIT = COLOURS.astype(np.uint16) * 257
+STRENGTH = np.random.default_rng(5).integers(0, 4000, 500).astype(np.uint16)
+
+
+def write_las(file, xyz=SAMPLE, point_format=2, colours=COLOURS_16_BIT, **others):
+    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.2")
+    header.scales, header.offsets = [0.001] * 3, np.floor(ORIGIN)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = xyz.T
+    las.intensity = STRENGTH[: len(xyz)]
+    if colours is not None:
+        las.red, las.green, las.blue = colours[: len(xyz)].astype(np.uint16).T
+    for name, value in others.items():
+        setattr(las, name, value)
+    las.write(file)
+
+
+def write_ply(file, encoding="binary_little_endian", kind="double", count=500):
+    order = ">" if encoding == "binary_big_endian" else "<"
+    head = f"ply\nformat {encoding} 1.0\ncomment made here\nelement vertex {count}\n" + "".join(
+        f"property {kind} {axis}\n" for axis in "xyz"
+    )
+    head += "".join(f"property uchar {channel}\n" for channel in ("red", "green", "blue"))
+    head += "property ushort intensity\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    if encoding == "ascii":
+        rows = np.column_stack([SAMPLE, COLOURS, STRENGTH])
+        body = "\n".join(" ".join(f"{value:.12g}" for value in row) for row in rows).encode() + b"\n"
+    else:
+        number = {"double": "f8", "float": "f4"}[kind]
+        dtype = [(axis, order + number) for axis in "xyz"] + [(c, "u1") for c in "rgb"] + [("i", order + "u2")]
+        table = np.zeros(500, dtype)
+        for axis in range(3):
+            table["xyz"[axis]], table["rgb"[axis]] = SAMPLE[:, axis], COLOURS[:, axis]
+        table["i"] = STRENGTH
+        body = table.tobytes()
+    file.write_bytes(head.encode() + body)
+
+
+def write_pcd(file, encoding="binary", packed=True):
+    head = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb intensity\nSIZE 8 8 8 4 4\nTYPE F F F F F\nCOUNT 1 1 1 1 1\n"
+        f"WIDTH 501\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 501\nDATA {encoding}\n"
+    )
+    whole = (COLOURS.astype(np.uint32) << np.array([16, 8, 0], np.uint32)).sum(axis=1).astype(np.uint32)
+    rows = np.zeros(501, [("x", "f8"), ("y", "f8"), ("z", "f8"), ("rgb", "f4"), ("i", "f4")])
+    for axis in range(3):
+        rows["xyz"[axis]][:500] = SAMPLE[:, axis]
+        rows["xyz"[axis]][500] = np.nan
+    rows["rgb"][:500], rows["i"][:500] = whole.view(np.float32), STRENGTH
+    if encoding == "ascii":
+        text = (f"{r['x']:.12g} {r['y']:.12g} {r['z']:.12g} {r['rgb']:.9g} {r['i']:.9g}" for r in rows)
+        file.write_bytes(head.encode() + "\n".join(text).encode() + b"\n")
+    else:
+        file.write_bytes(head.encode() + rows.tobytes())
+
+
+def write_text(file, head="", order="xyzirgb", separator=" "):
+    columns = {**dict(zip("xyz", SAMPLE.T, strict=True)), **dict(zip("rgb", COLOURS.T, strict=True)), "i": STRENGTH}
+    rows = np.column_stack([columns[name] for name in order])
+    file.write_text(head + "\n".join(separator.join(f"{value:.12g}" for value in row) for row in rows) + "\n")
+
+
+def write_e57(file):
+    pye57 = pytest.importorskip("pye57")
+    table = {f"cartesian{axis}": SAMPLE[:, i] for i, axis in enumerate("XYZ")}
+    table |= {f"color{name}": COLOURS[:, i] for i, name in enumerate(("Red", "Green", "Blue"))}
+    with pye57.E57(str(file), mode="w") as e57:
+        e57.write_scan_raw({**table, "intensity": STRENGTH.astype(np.float64)})
+
+
+WRITERS = {
+    "a.las": write_las,
+    "a.laz": write_las,
+    "b.laz": lambda file: write_las(file, point_format=7),
+    "a.ply": write_ply,
+    "b.ply": lambda file: write_ply(file, "ascii"),
+    "c.ply": lambda file: write_ply(file, "binary_big_endian"),
+    "a.pcd": write_pcd,
+    "b.pcd": lambda file: write_pcd(file, "ascii"),
+    "a.pts": lambda file: write_text(file, "500\n"),
+    "a.csv": lambda file: write_text(file, "X,Y,Z,Intensity,R,G,B\n", separator=","),
+    "b.csv": lambda file: write_text(file, "R;G;B;East;North;Height;intensity\n", "rgbxyzi", ";"),
+    "a.txt": lambda file: write_text(file, "# made here\n//X Y Z Intensity R G B\n"),
+    "a.xyz": write_text,
+    "a.e57": write_e57,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_format_keeps_millimetres_in_utm(tmp_path, name):
+    WRITERS[name](tmp_path / name)
+    cloud = read_cloud(tmp_path / name)
+    np.testing.assert_allclose(cloud.world_m, SAMPLE, atol=1e-6)
+    np.testing.assert_array_equal(cloud.colour, COLOURS)
+    np.testing.assert_array_equal(cloud.intensity, STRENGTH)
+    np.testing.assert_array_equal(cloud.origin_m, np.round(cloud.origin_m))
+    assert np.abs(cloud.origin_m - ORIGIN).max() < 3
+    assert cloud.notes == ()
+
+
+def test_compressed_pcd_is_read_with_open3d(tmp_path):
+    try:
+        import open3d
+    except (ImportError, OSError):
+        pytest.skip("open3d cannot be loaded here")
+    points = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(SAMPLE - ORIGIN))
+    open3d.io.write_point_cloud(tmp_path / "c.pcd", points, compressed=True)
+    np.testing.assert_allclose(read_cloud(tmp_path / "c.pcd").world_m, SAMPLE - ORIGIN, atol=1e-5)
+
+
+def test_without_open3d_one_sentence_names_the_packages(tmp_path, monkeypatch):
+    (tmp_path / "c.pcd").write_text(
+        "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+        "WIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA binary_compressed\n"
+    )
+    original = builtins.__import__
+
+    def without(name, *rest):
+        if name == "open3d":
+            raise OSError("libEGL.so.1: cannot open shared object file")
+        return original(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(InputError, match=r"libegl1 libgl1 libx11-6 libusb-1\.0-0 libudev1 libidn2-0"):
+        read_cloud(tmp_path / "c.pcd")
+    write_ply(tmp_path / "a.ply")
+    assert len(read_cloud(tmp_path / "a.ply")) == 500
+
+
+def test_text_without_names_is_understood_by_its_number_of_columns(tmp_path):
+    for order, colour, intensity in (("xyz", False, False), ("xyzi", False, True), ("xyzrgb", True, False)):
+        write_text(tmp_path / "a.xyz", order=order)
+        cloud = read_cloud(tmp_path / "a.xyz")
+        assert (cloud.colour is not None, cloud.intensity is not None) == (colour, intensity)
+    normals = np.column_stack([SAMPLE, np.tile([0.0, -0.6, 0.8], (500, 1))])
+    np.savetxt(tmp_path / "n.xyz", normals, fmt="%.6f")
+    assert read_cloud(tmp_path / "n.xyz").colour is None
+
+
+def test_noise_is_left_out_and_said_so(tmp_path):
+    write_las(tmp_path / "a.las", classification=np.where(np.arange(500) < 20, 7, 2).astype(np.uint8))
+    cloud = read_cloud(tmp_path / "a.las")
+    assert len(cloud) == 480
+    assert "20 points classified as noise were left out" in cloud.notes[0]
+
+
+def test_colour_or_intensity_that_says_nothing_is_none(tmp_path):
+    write_las(tmp_path / "a.las", colours=np.zeros((500, 3)), intensity=np.full(500, 7, np.uint16))
+    cloud = read_cloud(tmp_path / "a.las")
+    assert cloud.colour is None
+    assert cloud.intensity is None
+
+
+def test_single_precision_is_noted(tmp_path):
+    write_ply(tmp_path / "a.ply", kind="float")
+    assert "in steps of 250 mm" in read_cloud(tmp_path / "a.ply").notes[0]
+
+
+def cut(name, part):
+    def write(file):
+        WRITERS[name](file)
+        file.write_bytes(file.read_bytes()[: int(part * file.stat().st_size)])
+
+    return write
+
+
+def with_nan(file):
+    write_text(file, order="xyz")
+    lines = file.read_text().splitlines()
+    lines[41] = "nan 1 2"
+    file.write_text("\n".join(lines))
+
+
+def with_word(file):
+    write_text(file, order="xyz")
+    lines = file.read_text().splitlines()
+    lines[41] = "651234 here 2"
+    file.write_text("\n".join(lines))
+
+
+REFUSED = [
+    ("none.laz", lambda file: None, "not found"),
+    ("empty.laz", lambda file: file.touch(), "is empty"),
+    ("cloud.dwg", lambda file: file.write_text("x"), r"end in \.las, \.laz.*not in \.dwg"),
+    ("words.laz", lambda file: file.write_text("no cloud at all" * 100), "damaged or no LAS file"),
+    ("cut.las", cut("a.las", 0.6), "cut off|damaged"),
+    ("cut.laz", cut("a.laz", 0.6), "cut off|damaged"),
+    ("cut.ply", cut("a.ply", 0.6), r"ends after \d+ of 500 points"),
+    ("cut2.ply", cut("b.ply", 0.6), r"ends after \d+ of 500 points|line \d+ does not hold 7 numbers"),
+    ("cut3.ply", cut("a.ply", 0.003), "PLY header does not end"),
+    ("cut.pcd", cut("a.pcd", 0.6), r"ends after \d+ of 501 points"),
+    ("cut.pts", cut("a.pts", 0.6), r"ends after \d+ of 500 points|line \d+ does not hold 7 numbers"),
+    ("cut.e57", cut("a.e57", 0.6), "damaged or no E57"),
+    ("nopoints.las", lambda file: write_las(file, xyz=np.empty((0, 3)), colours=None), "0 points"),
+    ("nopoints.csv", lambda file: file.write_text("x,y,z\n"), "holds no points"),
+    ("nan.xyz", with_nan, r"1 points have coordinates that are not finite, the first is point 41"),
+    ("word.xyz", with_word, "line 42 does not hold 3 numbers"),
+    ("two.csv", lambda file: file.write_text("1,2\n3,4\n"), "line 1 is neither names of columns"),
+    ("five.csv", lambda file: file.write_text("1,2,3,4,5\n"), "has 5 columns without names"),
+    ("noz.ply", lambda file: file.write_bytes(
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\nend_header\n"
+        + struct.pack("<ff", 1, 2)), "has no column z"),
+    ("head.pcd", lambda file: file.write_text("VERSION 0.7\nDATA ascii\n1 2 3\n"), "PCD header is incomplete"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "write", "message"), REFUSED, ids=[entry[0] for entry in REFUSED])
+def test_a_file_that_cannot_be_used_gets_a_sentence(tmp_path, name, write, message):
+    write(tmp_path / name)
+    with pytest.raises(InputError, match=message) as refusal:
+        read_cloud(tmp_path / name)
+    assert name in str(refusal.value)
+
+
+def test_progress_reaches_its_end(tmp_path):
+    write_las(tmp_path / "a.laz")
+    told = []
+    read_cloud(tmp_path / "a.laz", lambda *state: told.append(state))
+    assert told == [("cloud", 500, 500)]
+
+
+def test_the_plane_is_the_ground_not_the_roof(building):
+    plane = fit_ground_plane(building)
+    places = ORIGIN[:2] + np.random.default_rng(1).uniform(-15, 15, (100, 2))
+    true = (places - ORIGIN[:2]) @ SLOPE + ORIGIN[2]
+    # The waves of the relief do not average out over the site to better than a few millimetres.
+    np.testing.assert_allclose(plane.z_m(places), true, atol=0.008)
+    assert plane.tilt_rad == pytest.approx(np.hypot(*SLOPE), abs=5e-4)
+    # Standard deviation of the relief alone: 0.04 / 2.
+    assert plane.elevation_std_m == pytest.approx(0.02, abs=0.004)
+    assert plane.elevation_p5_m == pytest.approx(-0.035, abs=0.008)
+    assert plane.elevation_p95_m == pytest.approx(0.035, abs=0.008)
+    assert plane.area_m2 > 800
+
+
+def test_the_plane_is_the_same_each_time_and_exact_without_noise(building):
+    assert fit_ground_plane(building) == fit_ground_plane(building)
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-10, 10, 0.1), np.arange(-10, 10, 0.1)))
+    flat = make_cloud(np.column_stack([x, y, 0.02 * x - 0.01 * y]) + ORIGIN)
+    plane = fit_ground_plane(flat)
+    assert plane.slope == pytest.approx((0.02, -0.01), abs=1e-9)
+    assert plane.elevation_std_m < 1e-6
+
+
+def test_a_plane_can_be_set_by_hand(building):
+    plane = fit_ground_plane(building, ground_z_m=113.05)
+    assert plane.z_m(ORIGIN[:2] + 7) == pytest.approx(113.05)
+    assert plane.tilt_rad == 0
+    with pytest.raises(InputError, match=r"without ground at z = 80\.00 m; correct orthoimage\.ground_z_m"):
+        fit_ground_plane(building, ground_z_m=80.0)
+
+
+def test_a_cloud_without_ground_is_refused():
+    random = np.random.default_rng(0)
+    wall = np.column_stack([random.uniform(-9, 9, 9000), np.zeros(9000), random.uniform(0, 30, 9000)])
+    steep = random.uniform(-9, 9, (9000, 2))
+    steep = np.column_stack([steep, 0.7 * steep[:, 0]])
+    mist = random.uniform(-15, 15, (9000, 3))
+    for points in (wall, steep, mist, mist[:5]):
+        with pytest.raises(InputError, match="a cloud without ground"):
+            fit_ground_plane(make_cloud(points))
+
+
+def test_elevation_of_the_ground_is_good_to_millimetres(building):
+    plane = fit_ground_plane(building)
+    places = np.random.default_rng(2).uniform(-13, 13, (1500, 2))
+    places = places[(np.abs(places) > [6.7, 4.7]).any(axis=1)]
+    found = ground_elevation(building, plane, places + ORIGIN[:2])
+    true = relief(places) + places @ SLOPE + ORIGIN[2] - plane.z_m(places + ORIGIN[:2])
+    assert np.isfinite(found).all()
+    # Some ten to twenty points of 4 mm noise, the nearest of which count most.
+    assert np.sqrt(np.mean((found - true) ** 2)) < 0.0025
+    assert abs(np.mean(found - true)) < 0.0003
+
+
+def test_elevation_ignores_objects_and_stays_unknown_where_nothing_is(building):
+    plane = fit_ground_plane(building)
+    random = np.random.default_rng(5)
+    # A crate of 25 cm beside the place, scanned as densely as the ground.
+    crate = np.column_stack([random.uniform(9.15, 9.3, 8), random.uniform(0.0, 0.3, 8), np.full(8, 0.25)])
+    objects = make_cloud(np.concatenate([building.world_m, crate + ORIGIN]))
+    place = np.array([[9.05, 0.15]])
+    before = ground_elevation(building, plane, place + ORIGIN[:2])
+    assert ground_elevation(objects, plane, place + ORIGIN[:2]) == pytest.approx(before, abs=0.01)
+    nowhere = np.array([[0.0, 0.0], [500.0, 500.0], [np.nan, 0.0]])
+    assert np.isnan(ground_elevation(building, plane, nowhere + ORIGIN[:2])).all()
+    assert ground_elevation(building, plane, np.empty((0, 2))).shape == (0,)
+
+
+def test_height_of_a_clicked_place_is_that_of_the_upper_surface(building):
+    plane = fit_ground_plane(building)
+    # At the very edge of the roof most points are on the wall.
+    for place in ([0.0, 0.0], [3.0, 3.95]):
+        height_m, spread_m, count = height_at(building, plane, ORIGIN[:2] + place)
+        true = ROOF_M + ORIGIN[2] - plane.z_m(ORIGIN[:2] + place)
+        assert height_m == pytest.approx(true, abs=0.003)
+        assert spread_m < 0.05
+        assert count > 20
+    assert height_at(building, plane, ORIGIN[:2] + [9.0, 9.0])[0] == pytest.approx(0.0, abs=0.06)
+    bird = make_cloud(np.concatenate([building.world_m, ORIGIN + [[0.0, 0.0, 25.0]]]))
+    assert height_at(bird, plane, ORIGIN[:2])[0] == pytest.approx(ROOF_M, abs=0.01)
+    with pytest.raises(InputError, match=r"only 0 points of the cloud lie within 0\.3 m"):
+        height_at(building, plane, ORIGIN[:2] + 300)
+
+
+def test_a_ray_picks_the_first_surface(building):
+    eye = ORIGIN + [0.0, -40.0, 60.0]
+    aim = ORIGIN + [1.0, 1.0, ROOF_M]
+    place = pick(building, eye, aim - eye, radius_m=0.15)
+    np.testing.assert_allclose(place, aim, atol=0.35)
+    assert place[2] - ORIGIN[2] == pytest.approx(ROOF_M, abs=0.02)
+    assert pick(building, eye, eye - aim) is None
+
+
+def test_thinning_is_even_repeatable_and_keeps_columns_together():
+    whole = site(60_000)
+    coloured = Cloud(whole.points_m, whole.origin_m, intensity=whole.points_m[:, 2].astype(np.float32))
+    few = thin(coloured, 5000)
+    assert 2500 < len(few) <= 5000
+    np.testing.assert_array_equal(few.points_m, thin(coloured, 5000).points_m)
+    np.testing.assert_array_equal(few.intensity, few.points_m[:, 2].astype(np.float32))
+    assert thin(few, 5000) is few
+
+
+def test_a_cloud_cannot_be_written_to(building):
+    with pytest.raises(ValueError, match="read-only"):
+        building.points_m[0, 0] = 1.0
