@@ -1,16 +1,17 @@
 // The 3-D scene beside the player: camera, frame and roof lines in step with it, motion exaggerated on request.
 
-import { post, projectPath } from "../lib/api.js";
+import { post, projectPath, sentence } from "../lib/api.js";
 import { fill, h } from "../lib/dom.js";
-import { sentence } from "../lib/api.js";
+import { pointsShown } from "../lib/graphics.js";
 
 const LEAST_PAUSE_MS = 80;
 
 export class SceneView {
   #active = false;
   #sending = false;
-  /** @type {Record<string, number | boolean> | null} */
-  #waiting = null;
+  #changed = false;
+  /** Always sent whole: the server remembers nothing of earlier wishes. */
+  #wish = { frame: 0, exaggeration: 1, points: 0 };
 
   /** @param {HTMLElement} host @param {string} projectId */
   constructor(host, projectId) {
@@ -30,7 +31,8 @@ export class SceneView {
     if (this.host.querySelector("iframe") === null) {
       this.host.prepend(h("iframe", { class: "scene-frame", title: "3-D scene: cloud, camera and roof lines", src: "/viser/?hideViserLogo" }));
     }
-    this.show({ frame, exaggeration: this.exaggeration });
+    this.#wish.points ||= pointsShown();
+    this.show(frame);
   }
 
   /** 1 to 100, in even ratios along the slider. */
@@ -38,26 +40,25 @@ export class SceneView {
     return Number((10 ** Number(this.slider.value)).toPrecision(2));
   }
 
-  /** Bring the scene up to the player; only the newest wish is sent. @param {Record<string, number | boolean>} wish */
-  show(wish) {
-    if (!this.#active) return;
-    this.#waiting = { ...this.#waiting, ...wish };
-    if (!this.#sending) void this.#send();
+  /** Bring the scene up to the player; of several frames only the newest is sent. @param {number} frame */
+  show(frame) {
+    this.#wish = { ...this.#wish, frame, exaggeration: this.exaggeration };
+    this.#changed = true;
+    if (this.#active && !this.#sending) void this.#send();
   }
 
   #exaggerate() {
     this.amount.textContent = `${this.exaggeration}×`;
     this.slider.setAttribute("aria-valuetext", `${this.exaggeration} times`);
-    this.show({ exaggeration: this.exaggeration });
+    this.show(this.#wish.frame);
   }
 
   async #send() {
     this.#sending = true;
-    while (this.#waiting !== null) {
-      const wish = this.#waiting;
-      this.#waiting = null;
+    while (this.#changed && this.#active) {
+      this.#changed = false;
       try {
-        const answer = await post(projectPath(this.projectId, "scene"), wish);
+        const answer = await post(projectPath(this.projectId, "scene"), this.#wish);
         this.#tell(answer?.ready === false ? answer.message : "");
       } catch (error) {
         this.#tell(sentence(error));

@@ -130,7 +130,7 @@ function keys() {
 function onFrame({ frame, time_s }) {
   setView({ frame });
   for (const plot of plots) plot.setPlayHead(time_s);
-  scene.show({ frame });
+  scene.show(frame);
   view.show(frame);
   showFacts();
 }

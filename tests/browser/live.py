@@ -1,0 +1,101 @@
+"""A real server on loopback, a real Chromium, a real small scene: what the browser tests stand on."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
+
+from core.run import run_project
+from sample_data.catalogue import build
+from sample_data.make import make
+
+CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextlib.contextmanager
+def serving(workspace: Path, port: int) -> Iterator[str]:
+    """Run `rooftrack serve` in a process of its own; yield its address without the last slash."""
+    command = [sys.executable, "-m", "app.cli", "serve", str(workspace), "--port", str(port)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            address = server.stdout.readline().strip().rstrip("/")
+            assert address.startswith("http://127.0.0.1:"), address
+            yield address
+        finally:
+            server.send_signal(signal.SIGINT)
+            try:
+                server.wait(timeout=15)
+            except subprocess.TimeoutExpired:
+                server.kill()
+
+
+@contextlib.contextmanager
+def chromium() -> Iterator[Browser]:
+    """The computer's own Chromium, or else the one Playwright brought."""
+    path = next((found for name in CHROMIUM_NAMES if (found := shutil.which(name))), None)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@contextlib.contextmanager
+def watched(browser: Browser, address: str, **options: Any) -> Iterator[Page]:
+    """Yield a page that must neither throw, nor be answered an internal error, nor ask any other computer."""
+    troubles: list[str] = []
+    context: BrowserContext = browser.new_context(**{"viewport": {"width": 1440, "height": 900}, **options})
+    context.set_default_timeout(20_000)
+    page = context.new_page()
+    page.on("pageerror", lambda error: troubles.append(f"threw {error}"))
+    page.on("request", lambda request: _note_outside(request.url, address, troubles))
+    page.on(
+        "response", lambda answer: troubles.append(f"{answer.status} {answer.url}") if answer.status >= 500 else None
+    )
+    yield page
+    context.close()
+    assert troubles == []
+
+
+def _note_outside(url: str, address: str, troubles: list[str]) -> None:
+    if not url.startswith((address, "data:", "blob:", address.replace("http", "ws", 1))):
+        troubles.append(f"asked {url}")
+
+
+def measured_scene(shared: Path) -> Path:
+    """Return a project folder with the rendered small scene and the headless engine's results, made once a session.
+
+    Several test processes may ask; one makes it while the others wait.
+    """
+    shared.mkdir(parents=True, exist_ok=True)
+    folder = shared / "scene"
+    with (shared / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "results" / "summary.json").exists():
+            make(build("small", seed=1), folder)
+            run_project(folder)
+    return folder
+
+
+def ask(address: str, path: str) -> Any:
+    """Return what the server answers to a GET."""
+    with urllib.request.urlopen(f"{address}/api/{path}") as answer:
+        return json.load(answer)
