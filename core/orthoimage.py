@@ -32,6 +32,10 @@ _FILL_SPACINGS = 1.5
 _SPACING_WINDOW_M = 1.0
 # Fewer points than this in the window are stray: each keeps its own pixel and fills nothing.
 _MIN_NEIGHBOURS = 4
+# A square metre with less than this part of the usual number of ground points does not count for the extent.
+_STRAY_SHARE = 0.02
+# More metres than any site is wide: makes one whole number of the two of a square metre.
+_FAR_M = 1 << 26
 # Points this far below the surface around them are seen through its gaps.
 _HIDDEN_BELOW_M = 0.5
 # Points this near the highest one of their pixel belong to the same surface.
@@ -135,7 +139,13 @@ def _extent_of_ground(
 ) -> tuple[tuple[float, float, float, float], tuple[str, ...]]:
     """Return where nearly all ground lies, each square metre counted once, on whole multiples of the pixel."""
     ground = np.abs(plane.height_of(cloud)) < RELIEF_REACH_M
-    metres = np.unique(np.floor(cloud.points_m[ground, :2]).astype(np.int32), axis=0)
+    own = np.floor(cloud.points_m[ground, :2]).astype(np.int64)
+    numbers, counts = np.unique(own[:, 0] * _FAR_M + own[:, 1], return_counts=True)
+    east = np.round(numbers / _FAR_M)
+    metres = np.stack([east, numbers - east * _FAR_M], axis=1)
+    metres = metres[counts >= max(2.0, _STRAY_SHARE * float(np.median(counts)))]
+    if not len(metres):
+        raise InputError("the ground of the point cloud is too thin for an orthoimage; set orthoimage.extent_m.")
     low, high = np.percentile(metres, 1, axis=0), np.percentile(metres, 99, axis=0) + 1
     notes: tuple[str, ...] = ()
     if np.prod((high - low) / pixel) > MAX_PIXELS:
