@@ -21,7 +21,7 @@ export async function gpsSettings(store) {
       });
       const antenna = /** @type {const} */ ([["Antenna east", 0], ["Antenna north", 1]]).map(([label, axis]) => numberField({ label, unit: "m", value: at[axis], decimals: 3, optional: true, onChange: (value) => (at[axis] = value) }).element);
       const submit = (/** @type {Event} */ event) => (event.preventDefault(), close(true));
-      const hint = h("p", { class: "small faint" }, "The antenna's place on the roof lets the building's rotation be taken into account. Leave it empty to compare with P1.");
+      const hint = h("p", { class: "small faint" }, "The antenna's place on the roof lets the building's rotation be taken into account. Leave it empty for the middle of P1 and P2.");
       return [h("form", { class: "dialog-form", onsubmit: submit }, h("div", { class: "dialog-body" }, h("div", { class: "field-row" }, inputs), h("div", { class: "field-row" }, antenna), hint), dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, "Save")))];
     },
   });

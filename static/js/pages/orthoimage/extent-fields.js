@@ -1,0 +1,33 @@
+// Part of the ground the orthoimage shows: typed, taken from the view, or all of the cloud.
+
+import { h } from "../../lib/dom.js";
+import { numberField } from "../../components/number-field.js";
+import { fixed } from "../../lib/format.js";
+
+/** @typedef {[number, number, number, number]} Extent west, south, east, north */
+
+const SIDES = ["west", "south", "east", "north"];
+
+/** @param {(extent: Extent | null) => void} onChange */
+export function extentFields(onChange) {
+  /** @type {(number | null)[]} */
+  let typed = [null, null, null, null];
+  const take = (/** @type {number} */ side, /** @type {number | null} */ value) => {
+    typed = typed.with(side, value);
+    const [west, south, east, north] = typed;
+    if (west !== null && south !== null && east !== null && north !== null) onChange([west, south, east, north]);
+    else if (typed.every((entry) => entry === null)) onChange(null);
+  };
+  const fields = SIDES.map((side, i) => numberField({ label: side, unit: "m", value: null, optional: true, compact: true, step: 0.5, onChange: (value) => take(i, value) }));
+  return {
+    element: h("div", { class: "field-row" }, fields.map((field) => field.element)),
+    /** @param {Extent | null} extent @param {Extent | null} made of the orthoimage as it is */
+    show(extent, made) {
+      typed = extent === null ? [null, null, null, null] : [...extent];
+      fields.forEach((field, i) => {
+        field.set(typed[i]);
+        field.input.placeholder = made === null ? "–" : fixed(made[i], 2);
+      });
+    },
+  };
+}

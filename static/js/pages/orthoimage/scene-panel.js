@@ -1,0 +1,56 @@
+// What the 3D scene shows: colours, how many points, which parts. viser draws it; the server decides from full data.
+
+import { post, projectPath } from "../../lib/api.js";
+import { fill, h } from "../../lib/dom.js";
+import { count, plural } from "../../lib/format.js";
+import { latest } from "../../lib/latest.js";
+import { segmented } from "../../components/segmented.js";
+import { toastError } from "../../components/toast.js";
+
+/** @typedef {"cloud" | "ground" | "orthoimage" | "camera" | "lines"} Part */
+
+const FEW = 100_000;
+const MANY = 1_000_000;
+const ALL = 5_000_000;
+const PARTS = /** @type {const} */ ([["cloud", "Cloud"], ["ground", "Ground plane"], ["orthoimage", "Orthoimage"], ["camera", "Camera"], ["lines", "Lines"]]);
+
+/** Whether this browser draws 3D without a graphics card. */
+function drawsInSoftware() {
+  const context = document.createElement("canvas").getContext("webgl");
+  const names = context?.getExtension("WEBGL_debug_renderer_info");
+  const renderer = names ? String(context?.getParameter(names.UNMASKED_RENDERER_WEBGL)) : "";
+  return context === null || /swiftshader|llvmpipe|software|basic render/i.test(renderer);
+}
+
+/** @param {HTMLElement} element @param {string} projectId @param {(message: string) => void} onMessage */
+export function scenePanel(element, projectId, onMessage) {
+  const wish = { colour: "rgb", points: drawsInSoftware() ? FEW : MANY, show: /** @type {Record<Part, boolean>} */ ({ cloud: true, ground: true, orthoimage: false, camera: true, lines: true }) };
+  const shown = h("p", { class: "small faint number", role: "status" });
+  const ask = latest(
+    (/** @type {typeof wish} */ wanted) => post(projectPath(projectId, "scene"), wanted),
+    (answer) => {
+      onMessage(answer.ready === false ? answer.message : "");
+      if (answer.points_total) shown.textContent = `${count(answer.points_shown)} of ${plural(answer.points_total, "point")} drawn; the engine uses all`;
+    },
+    toastError,
+  );
+  const send = () => ask(structuredClone(wish));
+  const colour = segmented({
+    label: "Colour of the cloud",
+    choices: [{ value: "rgb", name: "Colour" }, { value: "intensity", name: "Intensity" }, { value: "height", name: "Height" }],
+    value: "rgb",
+    onChange: (value) => ((wish.colour = value), send()),
+  });
+  const points = segmented({
+    label: "Points drawn",
+    choices: [{ value: String(FEW), name: "100 k" }, { value: String(MANY), name: "1 M" }, { value: String(ALL), name: "5 M" }],
+    value: String(wish.points),
+    onChange: (value) => ((wish.points = Number(value)), send()),
+  });
+  const parts = PARTS.map(([part, name]) => {
+    const input = h("input", { type: "checkbox", checked: wish.show[part], onchange: () => ((wish.show[part] = input.checked), send()) });
+    return h("label", { class: "check" }, input, name);
+  });
+  fill(element, h("header", {}, h("h2", {}, "3D view")), h("div", { class: "toolbar" }, colour.element, points.element), h("div", { class: "parts" }, parts), shown);
+  return { send };
+}
