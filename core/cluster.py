@@ -6,21 +6,23 @@ once, when its task has finished, and nothing is counted twice.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-
-import cv2
+from collections.abc import Callable, Iterator, Sequence
 
 from core.errors import InputError
 from core.measurements import FrameMeasurement, Reference
 from core.prediction import MeasureSetup
 
+# Measures frames start to stop (exclusive) on whatever machine it runs.
+ChunkWork = Callable[[MeasureSetup, int, int, Reference], list[FrameMeasurement]]
+
 
 def measure_on_cluster(
-    setup: MeasureSetup, chunks: Sequence[tuple[int, int]], reference: Reference, scheduler: str
+    work: ChunkWork, setup: MeasureSetup, chunks: Sequence[tuple[int, int]], *, reference: Reference, scheduler: str
 ) -> Iterator[FrameMeasurement]:
     """Yield the measurements of chunks as their tasks finish, frames of a chunk in order.
 
     Args:
+        work: what a task does; workers import it by name.
         chunks: (start, stop) frames.
         scheduler: address, such as `tcp://127.0.0.1:8786`.
 
@@ -36,20 +38,9 @@ def measure_on_cluster(
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error}); start one.") from None
     with client:
-        futures = [
-            client.submit(measure_chunk_remotely, setup, start, stop, reference, pure=False, retries=3)
-            for start, stop in chunks
-        ]
+        futures = [client.submit(work, setup, start, stop, reference, pure=False, retries=3) for start, stop in chunks]
         try:
             for future in as_completed(futures):
                 yield from future.result()
         finally:
             client.cancel(futures)
-
-
-def measure_chunk_remotely(setup: MeasureSetup, start: int, stop: int, reference: Reference) -> list[FrameMeasurement]:
-    """Return the measurements of one chunk; runs on a worker, on one core."""
-    from core.measure import Chunk, measure_chunk
-
-    cv2.setNumThreads(1)
-    return list(measure_chunk(setup, Chunk(start, stop), reference=reference, threads=1))

@@ -16,6 +16,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from core.cluster import measure_on_cluster
 from core.errors import InputError
 from core.following import CONFIRM_EVERY, make_follower
 from core.ground import FEATURES, GroundTracker, choose_features, ground_mask
@@ -233,9 +234,14 @@ def _side_by_side(
 def _on_cluster(
     setup: MeasureSetup, chunks: Sequence[Chunk], reference: Reference, scheduler: str
 ) -> Generator[FrameMeasurement, None, None]:
-    from core.cluster import measure_on_cluster
+    spans = [(chunk.start, chunk.stop) for chunk in chunks]
+    yield from measure_on_cluster(measure_remotely, setup, spans, reference=reference, scheduler=scheduler)
 
-    yield from measure_on_cluster(setup, [(chunk.start, chunk.stop) for chunk in chunks], reference, scheduler)
+
+def measure_remotely(setup: MeasureSetup, start: int, stop: int, reference: Reference) -> list[FrameMeasurement]:
+    """Return the measurements of one chunk; runs on a worker, on one core."""
+    cv2.setNumThreads(1)
+    return list(measure_chunk(setup, Chunk(start, stop), reference=reference, threads=1))
 
 
 def _require_alive(processes: Sequence[multiprocessing.process.BaseProcess]) -> None:

@@ -40,19 +40,38 @@ ORDER = (
     "validation",
     "results",
     "measurements",
+    "prediction",
     "paper",
+    "cluster",
     "measure",
     "preview",
+    "solution",
+    "solve_geometric",
+    "solve_paper",
     "solve",
     "figures",
     "report",
+    "export",
     "create",
     "check",
     "run",
 )
 # Steps of the measurement: others may know what they return, only conductors call them.
 STEPS = {"georeference", "ground", "roof_lines", "roof_points", "motion", "flight", "drift", "validation"}
-CONDUCTORS = {"following", "paper", "measure", "preview", "solve", "figures", "report", "check", "run"}
+CONDUCTORS = {
+    "following",
+    "paper",
+    "measure",
+    "preview",
+    "solve_geometric",
+    "solve_paper",
+    "solve",
+    "figures",
+    "report",
+    "export",
+    "check",
+    "run",
+}
 
 # Libraries that enter the program through one door only; the sample is rendered outside of it.
 DOORS = {
