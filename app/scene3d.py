@@ -11,6 +11,7 @@ The scene shows one project at a time, relative to a local origin, since a brows
 from __future__ import annotations
 
 import contextlib
+import io
 import secrets
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -137,7 +138,7 @@ class Scene3D:
         with self._lock:
             camera = self._started().initial_camera
             middle = at_m - self.origin_m
-            camera.position = tuple(middle + np.array([0.0, -1.0, 0.8]) * size_m)
+            camera.position = tuple(middle + np.array([0.3, -1.2, 0.9]) * size_m)
             camera.look_at = tuple(middle)
             camera.up = (0.0, 0.0, 1.0)
 
@@ -187,8 +188,8 @@ class Scene3D:
                     position=tuple(view.middle_m - self.origin_m),
                 )
             )
-            corner = view.middle_m - self.origin_m + np.array([-view.size_m / 2, -view.size_m / 2, 0.3])
-            add(scene.add_label("/ground/label", view.label, position=tuple(corner)))
+            edge = view.middle_m - self.origin_m + np.array([0.0, -view.size_m / 2, 0.3])
+            add(scene.add_label("/ground/label", view.label, position=tuple(edge), anchor="top-center"))
 
     def set_orthoimage(self, view: DrapeView, key: Any) -> None:
         """Lay the orthoimage on the ground."""
@@ -275,11 +276,14 @@ class Scene3D:
 
 
 def _guarded_viser(token: str) -> viser.ViserServer:
-    with _answering_only(token):
+    # Its greeting names an address that would refuse whoever tried it.
+    with _answering_only(token), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     for request in (viser_messages.ShareUrlRequest, viser_messages.ShareUrlDisconnect):
         server._websock_server.unregister_handler(request)
-    server.gui.configure_theme(show_share_button=False, show_logo=False, control_layout="collapsible")
+    server.gui.configure_theme(show_share_button=False, show_logo=False)
+    server.gui.set_panel_label("Scene")
+    server.gui.main_panel.minimize()
     server.scene.set_up_direction("+z")
     return server
 

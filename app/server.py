@@ -20,7 +20,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 from starlette.types import Scope
 
-from app.api import events, frames, geometry, inputs, orthoimage, projects, viser
+from app.api import events, frames, geometry, inputs, orthoimage, projects, scene, viser
 from app.context import Context, Here
 from app.errors import Missing, install_error_handlers
 from app.events import Hub
@@ -67,7 +67,7 @@ def create_app(workspace: Path, roots: Sequence[Path] = ()) -> FastAPI:
     app = FastAPI(title="Rooftrack", lifespan=_life, docs_url=None, redoc_url=None, openapi_url=None)
     app.state.context = context
     install_error_handlers(app)
-    for part in (projects, events, inputs, frames, orthoimage, geometry, viser):
+    for part in (projects, events, inputs, frames, orthoimage, geometry, scene, viser):
         app.include_router(part.router)
     _add_pages(app)
     app.add_middleware(Guard)
