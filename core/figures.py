@@ -423,7 +423,9 @@ def frame_figure(
     """
     lines = {name: np.asarray(points, dtype=np.float64).reshape(-1, 2) for name, points in lines_px.items()}
     height, width = image.shape[:2]
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 3.5), layout="constrained")
+    # As high as the whole frame needs, and half an inch for the names.
+    height_in = min(0.59 * PAGE_WIDTH_IN * height / width, 6.0) + 0.5
+    figure = Figure(figsize=(PAGE_WIDTH_IN, height_in), layout="constrained")
     whole, roof = figure.subplots(1, 2, width_ratios=(3, 2))
     for panel in (whole, roof):
         panel.imshow(image, cmap="gray", interpolation="antialiased", vmin=0, vmax=255)

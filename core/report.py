@@ -57,10 +57,11 @@ class Correction:
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A figure as the bytes of its PNG file, and its caption."""
+    """A figure as the bytes of its PNG file, its caption, and the share of the page's width it was drawn for."""
 
     caption: str
     png: bytes
+    width: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -386,7 +387,8 @@ def _figure(figure: ReportFigure) -> str:
     data = base64.b64encode(figure.png).decode("ascii")
     caption = escape(figure.caption)
     return (
-        f'<figure><img src="data:image/png;base64,{data}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
+        f'<figure><img src="data:image/png;base64,{data}" alt="{caption}" style="width: {100 * figure.width:.0f}%">'
+        f"<figcaption>{caption}</figcaption></figure>"
     )
 
 
