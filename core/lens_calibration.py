@@ -7,7 +7,7 @@ image and by the variety of its tilts, since a lens is known only where and how 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,12 @@ _VIDEO_PARTS = 40
 _FRAMES_PER_PART = 5
 # A board is looked for in a picture of about this width first: fast, and blind to fine texture.
 _SEARCH_WIDTH_PX = 1600
-# An edge between squares that rises over more pixels than this was out of focus or moved.
-_BLURRED_PX = 6.0
+# A view whose edges rise over so many times more pixels than those of the others was out of focus or moved;
+_BLURRED_RATIO = 2.0
+# edges as sharp as this are never blamed;
+_SHARP_PX = 5.0
+# where they fill so much of a square, the corners run into each other.
+_BLURRED_SHARE = 0.4
 # A view whose error is this many times the median of all is an outlier: a bent board, a wrong corner.
 _OUTLIER_RATIO = 2.5
 _OUTLIER_FLOOR_PX = 0.15
@@ -48,6 +52,7 @@ class View:
     Attributes:
         name: of the file, with the frame number for a video.
         corners_px: (N, 2) raw pixels, row by row of the board, or None where none was found.
+        edge_px: pixels over which the edges of the squares rise; small is sharp.
         rms_px: reprojection error, or None where the view was left out before.
         tilt_rad: angle between the board and the image plane, or None.
         left_out: why it was left out; empty where it was used.
@@ -55,6 +60,7 @@ class View:
 
     name: str
     corners_px: Floats | None = None
+    edge_px: float | None = None
     rms_px: float | None = None
     tilt_rad: float | None = None
     left_out: str = ""
@@ -111,6 +117,7 @@ class Calibration:
                     "name": view.name,
                     "used": not view.left_out,
                     "left_out": view.left_out,
+                    "edge_px": view.edge_px,
                     "rms_px": view.rms_px,
                     "tilt_rad": view.tilt_rad,
                     "corners_px": None if view.corners_px is None else np.round(view.corners_px, 2).tolist(),
@@ -182,7 +189,7 @@ def calibrate_images(images: Iterable[tuple[str, Luma]], board: tuple[int, int],
         views.append(_view(name, image, board))
     if size is None:
         raise InputError("no pictures of a checkerboard were given; give 10 to 30, tilted, to the edges of the image.")
-    views, fit = _fitted(views, (size[1], size[0]), board, square_m)
+    views, fit = _fitted(_without_blurred(views, board), (size[1], size[0]), board, square_m)
     return _judged(views, fit, (size[1], size[0]), board, square_m)
 
 
@@ -242,10 +249,27 @@ def _view(name: str, image: Luma, board: tuple[int, int]) -> View:
     if corners is None:
         return View(name, left_out=f"no board of {board[0]} x {board[1]} inner corners found")
     across, _ = cv2.estimateChessboardSharpness(image, board, corners.astype(np.float32).reshape(-1, 1, 2))
-    rise = float(np.ravel(across)[0])
-    if rise > _BLURRED_PX:
-        return View(name, read_only(corners), left_out=f"blurred, edges rise over {rise:.1f} px")
-    return View(name, read_only(corners))
+    return View(name, read_only(corners), edge_px=float(np.ravel(across)[0]))
+
+
+def _without_blurred(views: list[View], board: tuple[int, int]) -> list[View]:
+    """Leave out what is much less sharp than the other views, or too blurred for its squares."""
+    usual = float(np.median([view.edge_px for view in views if view.edge_px is not None] or [0.0]))
+    judged = []
+    for view in views:
+        if view.edge_px is not None and view.corners_px is not None:
+            limit = min(
+                max(_BLURRED_RATIO * usual, _SHARP_PX), _BLURRED_SHARE * _shortest_square_px(view.corners_px, board)
+            )
+            if not view.edge_px <= limit:
+                view = replace(view, left_out=f"blurred, edges rise over {view.edge_px:.1f} px, {limit:.1f} at most")
+        judged.append(view)
+    return judged
+
+
+def _shortest_square_px(corners: Floats, board: tuple[int, int]) -> float:
+    grid = corners.reshape(board[1], board[0], 2)
+    return float(min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)))
 
 
 def _find_corners(image: Luma, board: tuple[int, int]) -> Floats | None:
@@ -262,9 +286,7 @@ def _find_corners(image: Luma, board: tuple[int, int]) -> Floats | None:
         return None
     # A reduced pixel spans `scale` full ones, so their centres differ by half of what it spans more.
     corners = (np.asarray(rough, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
-    grid = corners.reshape(board[1], board[0], 2)
-    shortest = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
-    reach = int(np.clip(0.35 * shortest, 3, 15))
+    reach = int(np.clip(0.35 * _shortest_square_px(corners, board), 3, 15 * scale))
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
     refined = cv2.cornerSubPix(image, corners.astype(np.float32).reshape(-1, 1, 2), (reach, reach), (-1, -1), criteria)
     return np.asarray(refined, dtype=np.float64).reshape(-1, 2)
@@ -302,9 +324,9 @@ def _fitted(
         error = float(fit.rms_of_views_px[worst])
         view = views[used[worst]]
         reason = f"outlier, RMS {error:.2f} px where the others have {np.median(fit.rms_of_views_px):.2f}"
-        views[used[worst]] = View(view.name, view.corners_px, error, float(fit.tilts_rad[worst]), reason)
+        views[used[worst]] = replace(view, rms_px=error, tilt_rad=float(fit.tilts_rad[worst]), left_out=reason)
     for number, rms_px, tilt_rad in zip(used, fit.rms_of_views_px, fit.tilts_rad, strict=True):
-        views[number] = View(views[number].name, views[number].corners_px, float(rms_px), float(tilt_rad))
+        views[number] = replace(views[number], rms_px=float(rms_px), tilt_rad=float(tilt_rad))
     return views, fit
 
 

@@ -14,19 +14,19 @@ from core.lens_calibration import calibrate, calibrate_images
 from core.progress import CancelToken
 
 BOARD, SQUARE_M = (9, 6), 0.025
-TRUE = Lens((960, 640), [[820.0, 0, 472.0], [0, 815.0, 326.0], [0, 0, 1]], [-0.18, 0.06, 8e-4, -5e-4, 0.0])
+TRUE = Lens((720, 480), [[615.0, 0, 354.0], [0, 611.0, 244.0], [0, 0, 1]], [-0.18, 0.06, 8e-4, -5e-4, 0.0])
 # Turn about x and y in radians, distance in metres, middle of the board in the image in pixels.
 POSES = [
-    (0.0, 0.0, 0.35, (480, 320)),
-    (0.5, 0.1, 0.32, (300, 220)),
-    (-0.5, 0.2, 0.33, (660, 230)),
-    (0.2, 0.55, 0.34, (300, 430)),
-    (0.1, -0.55, 0.34, (680, 430)),
-    (-0.4, -0.4, 0.30, (480, 300)),
-    (0.4, 0.4, 0.45, (200, 160)),
-    (0.45, -0.4, 0.45, (760, 160)),
-    (-0.4, 0.45, 0.45, (200, 490)),
-    (-0.45, -0.35, 0.45, (760, 480)),
+    (0.0, 0.0, 0.35, (360, 240)),
+    (0.5, 0.1, 0.32, (225, 165)),
+    (-0.5, 0.2, 0.33, (495, 172)),
+    (0.2, 0.55, 0.34, (225, 322)),
+    (0.1, -0.55, 0.34, (510, 322)),
+    (-0.4, -0.4, 0.30, (360, 225)),
+    (0.4, 0.4, 0.45, (150, 120)),
+    (0.45, -0.4, 0.45, (570, 120)),
+    (-0.4, 0.45, 0.45, (150, 367)),
+    (-0.45, -0.35, 0.45, (570, 360)),
 ]
 
 
@@ -72,8 +72,10 @@ def test_the_lens_is_found_within_its_own_uncertainty():
     K, true = found.lens.camera_matrix, TRUE.camera_matrix
     errors = np.array([K[0, 0] - true[0, 0], K[1, 1] - true[1, 1], K[0, 2] - true[0, 2], K[1, 2] - true[1, 2]])
     assert (np.abs(errors) < 5 * found.deviations[:4] + 0.05).all()
-    seen = np.stack(np.meshgrid(np.linspace(150, 800, 9), np.linspace(120, 520, 7)), axis=-1)
-    np.testing.assert_allclose(found.lens.rays_from_raw(seen) * 820, TRUE.rays_from_raw(seen) * 820, atol=0.5)
+    seen = np.stack(np.meshgrid(np.linspace(110, 600, 9), np.linspace(90, 390, 7)), axis=-1)
+    off_px = 615 * (found.lens.rays_from_raw(seen) - TRUE.rays_from_raw(seen)).reshape(-1, 2)
+    # A shift common to all is a turn of the camera; what counts is the shape that remains.
+    np.testing.assert_allclose(off_px - off_px.mean(axis=0), 0.0, atol=0.2)
 
 
 def test_report_tells_all_in_words_and_in_json():
@@ -83,7 +85,7 @@ def test_report_tells_all_in_words_and_in_json():
     assert np.array(facts["views"][0]["corners_px"]).shape == (54, 2)
     assert np.sum(facts["coverage_grid"]) == 54 * len(POSES)
     assert 0.5 < found.covered_share <= 1.0
-    assert "10 of 10 views used, 960 x 640" in found.report()
+    assert "10 of 10 views used, 720 x 480" in found.report()
     assert "view3.png: RMS" in found.report()
     assert found.lens.sigma.focal_relative >= 2e-4
 
@@ -96,11 +98,11 @@ def test_the_lens_survives_its_file(tmp_path):
 
 
 def test_bad_pictures_are_named_and_left_out():
-    grey = np.full((640, 960), 128, np.uint8)
-    blurred = photograph((0.3, 0.3, 0.35, (480, 320)), blur_px=7.0)
+    grey = np.full((480, 720), 128, np.uint8)
+    blurred = photograph((0.3, 0.3, 0.35, (360, 240)), blur_px=7.0)
     bent = photographs()[5][1].copy()
     # A board bent by the wind: its upper half shifted by three pixels.
-    bent[:300] = np.roll(bent[:300], 3, axis=1)
+    bent[:225] = np.roll(bent[:225], 3, axis=1)
     bad = (("grey.png", grey), ("blurred.png", blurred), ("bent.png", bent))
     found = calibrate_images([*photographs(), *bad], BOARD, SQUARE_M)
     reasons = {view.name: view.left_out for view in found.views if view.left_out}
@@ -113,7 +115,7 @@ def test_bad_pictures_are_named_and_left_out():
 
 def test_few_frontal_views_are_warned_of():
     frontal = [
-        (f"f{i}", photograph((0.02 * i, 0.03 * (i % 3), 0.4 + 0.02 * i, (430 + 25 * i, 320)), seed=i)) for i in range(4)
+        (f"f{i}", photograph((0.02 * i, 0.03 * (i % 3), 0.4 + 0.02 * i, (320 + 20 * i, 240)), seed=i)) for i in range(4)
     ]
     warnings = " ".join(calibrate_images(frontal, BOARD, SQUARE_M).warnings)
     assert "only 4 views are used" in warnings
@@ -130,8 +132,8 @@ def test_mistakes_get_sentences(tmp_path):
         calibrate_images([], BOARD, SQUARE_M)
     with pytest.raises(InputError, match="cannot tell a lens"):
         calibrate_images(photographs(), (2, 6), SQUARE_M)
-    small = ("small.png", np.zeros((320, 480), np.uint8))
-    with pytest.raises(InputError, match=r"small\.png: has 480 x 320 pixels, the pictures before it 960 x 640"):
+    small = ("small.png", np.zeros((240, 360), np.uint8))
+    with pytest.raises(InputError, match=r"small\.png: has 360 x 240 pixels, the pictures before it 720 x 480"):
         calibrate_images([photographs()[0], small], BOARD, SQUARE_M)
     with pytest.raises(InputError, match="not found"):
         calibrate([tmp_path / "none.jpg"], board=BOARD, square_m=SQUARE_M)
@@ -149,7 +151,8 @@ def test_files_are_read_and_can_be_stopped(tmp_path):
     found = calibrate(
         files, board=BOARD, square_m=SQUARE_M, progress=lambda stage, done, total: told.append((done, total))
     )
-    np.testing.assert_array_equal(found.lens.camera_matrix, calibration().lens.camera_matrix)
+    # The bundle sums in parallel, in an order of its own: the last digits differ.
+    np.testing.assert_allclose(found.lens.camera_matrix, calibration().lens.camera_matrix, rtol=1e-6)
     assert told[-1] == (10, 10)
     cancel = CancelToken()
     cancel.cancel()
@@ -161,7 +164,7 @@ def test_a_video_gives_its_sharp_frames(tmp_path):
     file = tmp_path / "board.mp4"
     with av.open(str(file), "w") as container:
         stream = container.add_stream("libx264", rate=30, options={"crf": "12", "preset": "ultrafast"})
-        stream.width, stream.height, stream.pix_fmt = 960, 640, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = 720, 480, "yuv420p"
         for _, image in photographs()[:6]:
             for number in range(5):
                 shown = image if number == 2 else cv2.GaussianBlur(image, (0, 0), 4.0)
