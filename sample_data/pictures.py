@@ -28,6 +28,8 @@ HERE = Path(__file__).parent
 SAMPLE = HERE / "sample"
 PICTURES = HERE / "screenshots"
 SIZE_PX = (1440, 900)
+# What a page shows while it waits for the engine.
+BUSY = "progress, .pane-note"
 # Enough that neither plots nor photographs show steps; a photograph in full colour would be four times as large.
 COLOURS = 256
 CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -88,6 +90,8 @@ def _take(browser: Browser, address: str, shot: Shot, folder: Path) -> Path:
     page.goto(f"{address}{shot.step}{shot.query.format(peak=peak)}")
     page.wait_for_selector(shot.ready)
     page.wait_for_timeout(1000 * shot.settles_s)
+    page.wait_for_function(f"() => ![...document.querySelectorAll('{BUSY}')].some((one) => one.checkVisibility())")
+    page.wait_for_timeout(500)
     picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     context.close()
     folder.mkdir(parents=True, exist_ok=True)

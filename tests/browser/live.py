@@ -14,6 +14,7 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
@@ -76,8 +77,14 @@ def watched(browser: Browser, address: str, **options: Any) -> Iterator[Page]:
 
 
 def _note_outside(url: str, address: str, troubles: list[str]) -> None:
-    if not url.startswith((address, "data:", "blob:", address.replace("http", "ws", 1))):
+    asked = urlsplit(url)
+    if asked.scheme not in ("data", "blob") and asked.netloc != urlsplit(address).netloc:
         troubles.append(f"asked {url}")
+
+
+def _note_failure(status: int, url: str, troubles: list[str]) -> None:
+    if status >= 500:
+        troubles.append(f"{status} {url}")
 
 
 def measured_scene(shared: Path) -> Path:
@@ -95,7 +102,7 @@ def measured_scene(shared: Path) -> Path:
     return folder
 
 
-def ask(address: str, path: str) -> Any:
-    """Return what the server answers to a GET."""
-    with urllib.request.urlopen(f"{address}/api/{path}") as answer:
+def ask(pages: str, path: str) -> Any:
+    """Return what the server answers about a project, given the address of its pages."""
+    with urllib.request.urlopen(f"{pages.replace('/p/', '/api/projects/')}/{path}") as answer:
         return json.load(answer)

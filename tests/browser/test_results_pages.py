@@ -16,6 +16,7 @@ from core.project import read_project
 from core.results import read_history_csv
 from tests.browser.live import ask, chromium, free_port, measured_scene, serving, watched
 
+FRAMES = 240
 FRAME = 120  # in the middle of the shaking
 WITHIN_PX = 0.5
 
@@ -31,28 +32,37 @@ def browser():
         yield found
 
 
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    """A workspace and the address of the server over it."""
+    workspace = tmp_path_factory.mktemp("workspace")
+    with serving(workspace, free_port()) as address:
+        yield workspace, address
+
+
 @pytest.fixture
-def workspace(scene, tmp_path):
-    """A workspace with the scene measured by the headless engine."""
-    shutil.copytree(scene, tmp_path / "workspace" / "small")
-    return tmp_path / "workspace"
+def project(scene, server, request):
+    """A project of its own for each test, measured by the headless engine: its folder and its pages' address."""
+    workspace, address = server
+    name = re.sub(r"[^a-z0-9]+", "-", request.node.name)[:40]
+    shutil.copytree(scene, workspace / name)
+    return workspace / name, f"{address}/p/{name}"
 
 
-def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engine(browser, scene, workspace):
-    project = workspace / "small"
-    shutil.rmtree(project / "results")
+def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engine(browser, scene, tmp_path):
+    shutil.copytree(scene, tmp_path / "small", ignore=shutil.ignore_patterns("results"))
     port = free_port()
-    with serving(workspace, port) as address, watched(browser, address) as page:
+    with serving(tmp_path, port) as address, watched(browser, address) as page:
         page.goto(f"{address}/p/small/track")
         page.get_by_role("button", name="Start").click()
         page.wait_for_function("() => parseInt(document.querySelector('.figures .value')?.textContent) > 5")
         page.get_by_role("button", name="Cancel").click()
         expect(page.get_by_role("button", name="Resume")).to_be_visible()
-    kept = ask_kept(workspace, port)
-    assert 5 < kept < 240
-    with serving(workspace, port) as address, watched(browser, address) as page:
+    with serving(tmp_path, port) as address, watched(browser, address) as page:
+        kept = ask(f"{address}/p/small", "track")["frames_done"]
+        assert 5 < kept < FRAMES
         page.goto(f"{address}/p/small/track")
-        expect(page.locator(".note.info")).to_contain_text(f"{kept} of 240 frames")
+        expect(page.locator(".note.info")).to_contain_text(f"{kept} of {FRAMES} frames")
         page.keyboard.press("r")
         expect(page.get_by_role("link", name="Review the result")).to_be_visible(timeout=60_000)
         page.goto(f"{address}/p/small/export")
@@ -63,12 +73,6 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
     assert downloaded == (scene / "results" / "roof.csv").read_bytes()
 
 
-def ask_kept(workspace: Path, port: int) -> int:
-    """Frames the engine kept, told by a server that starts anew."""
-    with serving(workspace, port) as address:
-        return int(ask(address, "projects/small/track")["frames_done"])
-
-
 def at_rest(page: Page, frame: int) -> None:
     """Wait until a frame is on the screen with all its pixels."""
     page.wait_for_selector(f'.review-frame[data-frame="{frame}"]')
@@ -77,15 +81,16 @@ def at_rest(page: Page, frame: int) -> None:
 
 @pytest.mark.parametrize("ratio", [1, 2])
 @pytest.mark.parametrize("zooms", [0, 3])
-def test_the_overlay_lies_where_the_engine_measured(browser, workspace, ratio, zooms):
-    with serving(workspace, free_port()) as address, watched(browser, address, device_scale_factor=ratio) as page:
-        page.goto(f"{address}/p/small/review?frame={FRAME}&hidden=rejected,bands,edges")
+def test_the_overlay_lies_where_the_engine_measured(browser, project, ratio, zooms):
+    _, pages = project
+    with watched(browser, pages, device_scale_factor=ratio) as page:
+        page.goto(f"{pages}/review?frame={FRAME}&hidden=rejected,bands,edges")
         at_rest(page, FRAME)
         page.locator(".review-frame").focus()
         for _ in range(zooms):
             page.keyboard.press("+")
         page.wait_for_timeout(200)
-        measured = ask(address, f"projects/small/review/{FRAME}")
+        measured = ask(pages, f"review/{FRAME}")
         to_canvas = placed_by(page, (960, 540), 1.4**zooms)
         marks_agree(page, measured["targets"]["roof"], to_canvas)
         features_agree(page, np.array(measured["ground"]["used"]), to_canvas, ratio)
@@ -145,16 +150,17 @@ def features_agree(page: Page, used, to_canvas, ratio):
     assert np.abs(np.array(middles) - alone).max() < WITHIN_PX
 
 
-def test_the_next_frame_comes_quickly_and_the_plot_and_player_lead_each_other(browser, workspace):
-    with serving(workspace, free_port()) as address, watched(browser, address) as page:
-        page.goto(f"{address}/p/small/review?frame={FRAME}")
+def test_the_next_frame_comes_quickly_and_the_plot_and_player_lead_each_other(browser, project):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/review?frame={FRAME}")
         at_rest(page, FRAME)
         steps_ms = []
         for frame in range(FRAME + 1, FRAME + 9):
             page.wait_for_timeout(150)
             steps_ms.append(page.evaluate(TIMED_STEP, frame))
         assert np.median(steps_ms) < 150, steps_ms
-        history = ask(address, "projects/small/results/roof")
+        history = ask(pages, "results/roof")
         area = page.locator(".review-plots .u-over").first.bounding_box()
         page.mouse.click(area["x"] + 0.25 * area["width"], area["y"] + 30)
         times = history["time_s"]
@@ -185,9 +191,10 @@ def wait_for_url(page: Page, pattern: str) -> str:
     return page.url
 
 
-def test_frames_drawn_over_are_excluded_and_come_back_with_undo(browser, workspace):
-    with serving(workspace, free_port()) as address, watched(browser, address) as page:
-        page.goto(f"{address}/p/small/review?frame=30")
+def test_frames_drawn_over_are_excluded_and_come_back_with_undo(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/review?frame=30")
         at_rest(page, 30)
         area = page.locator(".review-plots .u-over").first.bounding_box()
         page.keyboard.down("Shift")
@@ -198,10 +205,10 @@ def test_frames_drawn_over_are_excluded_and_come_back_with_undo(browser, workspa
         page.keyboard.up("Shift")
         with page.expect_response(re.compile(r"/results/roof")):
             page.keyboard.press("x")
-        (first, last) = read_project(workspace / "small").excluded_frames[0]
-        assert first == pytest.approx(0.5 * 239, abs=2)
-        assert last == pytest.approx(0.6 * 239, abs=2)
-        history = read_history_csv(workspace / "small" / "results" / "roof.csv")
+        (first, last) = read_project(folder).excluded_frames[0]
+        assert first == pytest.approx(0.5 * (FRAMES - 1), abs=2)
+        assert last == pytest.approx(0.6 * (FRAMES - 1), abs=2)
+        history = read_history_csv(folder / "results" / "roof.csv")
         assert set(history.status[first : last + 1].tolist()) == {"excluded"}
         assert "excluded" not in history.status[:first].tolist()
         expect(page.get_by_label("Excluded frames", exact=True)).to_contain_text(f"{first}–{last}")
@@ -209,15 +216,16 @@ def test_frames_drawn_over_are_excluded_and_come_back_with_undo(browser, workspa
         at_rest(page, 30)
         page.keyboard.press("Control+z")
         expect(page.get_by_label("Excluded frames", exact=True)).to_contain_text("None")
-        assert read_project(workspace / "small").excluded_frames == ()
+        assert read_project(folder).excluded_frames == ()
 
 
-def test_the_corner_slider_shows_what_the_engine_filters(browser, workspace):
-    history = read_history_csv(workspace / "small" / "results" / "roof.csv")
-    with serving(workspace, free_port()) as address, watched(browser, address) as page:
-        page.goto(f"{address}/p/small/drift")
+def test_the_corner_slider_shows_what_the_engine_filters(browser, project):
+    folder, pages = project
+    history = read_history_csv(folder / "results" / "roof.csv")
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/drift")
         expect(page.locator(".drift-lower .plot-legend").first).to_contain_text("East")
-        before = read_project(workspace / "small").drift.corner_hz
+        before = read_project(folder).drift.corner_hz
         slider = page.get_by_role("slider", name="Corner frequency")
         slider.focus()
         answers = []
@@ -235,7 +243,7 @@ def test_the_corner_slider_shows_what_the_engine_filters(browser, workspace):
         assert np.nanmin(np.abs(1000 * expected[:, 0] - shown)) < 0.06
         page.wait_for_function("() => document.querySelector('.save-state').dataset.state === 'saved'")
         expect(page.locator(".warnings")).not_to_be_empty()
-        assert read_project(workspace / "small").drift.corner_hz == pytest.approx(corner)
+        assert read_project(folder).drift.corner_hz == pytest.approx(corner)
 
 
 def hovered_value(page: Page, label: str) -> float:
@@ -248,9 +256,10 @@ def hovered_value(page: Page, label: str) -> float:
     return float(number) * {"mm": 1, "cm": 10}[unit]
 
 
-def test_the_interval_of_rest_is_dragged_on_the_plot(browser, workspace):
-    with serving(workspace, free_port()) as address, watched(browser, address) as page:
-        page.goto(f"{address}/p/small/drift")
+def test_the_interval_of_rest_is_dragged_on_the_plot(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/drift")
         area = page.locator(".drift-main .u-over").bounding_box()
         with page.expect_response(re.compile(r"/drift/sweep")):
             page.mouse.move(area["x"] + 0.05 * area["width"], area["y"] + 60)
@@ -258,20 +267,21 @@ def test_the_interval_of_rest_is_dragged_on_the_plot(browser, workspace):
             page.mouse.move(area["x"] + 0.3 * area["width"], area["y"] + 60, steps=5)
             page.mouse.up()
         page.wait_for_function("() => document.querySelector('.save-state').dataset.state === 'saved'")
-        duration = 239 / 30
-        start, end = read_project(workspace / "small").intervals_s.pre_event
+        duration = (FRAMES - 1) / 30
+        start, end = read_project(folder).intervals_s.pre_event
         assert (start, end) == (pytest.approx(0.05 * duration, abs=0.03), pytest.approx(0.3 * duration, abs=0.03))
         handle = page.get_by_role("slider", name="End of pre-event")
         handle.focus()
         with page.expect_response(re.compile(r"/drift/sweep")):
             handle.press("Shift+ArrowLeft")
-        assert read_project(workspace / "small").intervals_s.pre_event[1] == pytest.approx(end - 1, abs=0.002)
+        assert read_project(folder).intervals_s.pre_event[1] == pytest.approx(end - 1, abs=0.002)
 
 
-def test_table_2_says_what_the_summary_says(browser, workspace):
-    gps = json.loads((workspace / "small" / "results" / "summary.json").read_text())["targets"]["roof"]["gps"]
-    with serving(workspace, free_port()) as address, watched(browser, address) as page:
-        page.goto(f"{address}/p/small/export")
+def test_table_2_says_what_the_summary_says(browser, project):
+    folder, pages = project
+    gps = json.loads((folder / "results" / "summary.json").read_text())["targets"]["roof"]["gps"]
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/export")
         row = page.locator(".comparison tbody tr").first
         expect(row).to_contain_text("East")
         cells = [cell.replace("−", "-") for cell in row.locator("td").all_inner_texts()]

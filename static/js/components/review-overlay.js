@@ -19,7 +19,8 @@ export const LAYERS = [
 ];
 
 const GROUND_RADIUS = 3.5;
-const EDGE_RADIUS = 1.6;
+// Edge points lie a few raw px apart: small where the picture is small, so that they do not run together.
+const EDGE_RADIUS = { least: 1, most: 2.6, perScale: 0.7 };
 
 /**
  * Bands, lines and intersections as shapes of a pane.
@@ -83,7 +84,7 @@ export class PointPainter {
     if (this.shown.has("rejected")) this.#stroke(context, crosses(ground.rejected, view, GROUND_RADIUS), rejected);
     if (!this.shown.has("edges")) return;
     for (const overlay of Object.values(targets)) {
-      for (const points of Object.values(overlay.edges_raw ?? {})) fillDots(context, points, view, edge);
+      for (const points of Object.values(overlay.edges_raw ?? {})) fillDots(context, points, view, { colour: edge, halo: this.colours.halo });
       this.#stroke(context, circles(overlay.points_raw?.used ?? [], view, GROUND_RADIUS), edge);
       this.#stroke(context, crosses(overlay.points_raw?.rejected ?? [], view, GROUND_RADIUS), rejected);
     }
@@ -124,14 +125,18 @@ function crosses(points, view, radius) {
   return path;
 }
 
-/** @param {CanvasRenderingContext2D} context @param {Point[]} points @param {View} view @param {string} colour */
-function fillDots(context, points, view, colour) {
+/** @param {CanvasRenderingContext2D} context @param {Point[]} points @param {View} view @param {{colour: string, halo: string}} paint */
+function fillDots(context, points, view, { colour, halo }) {
+  const radius = Math.min(Math.max(EDGE_RADIUS.perScale * view.scale, EDGE_RADIUS.least), EDGE_RADIUS.most);
   const path = new Path2D();
   for (const point of points) {
     const [x, y] = view.toCanvas(point);
-    path.moveTo(x + EDGE_RADIUS, y);
-    path.arc(x, y, EDGE_RADIUS, 0, 2 * Math.PI);
+    path.moveTo(x + radius, y);
+    path.arc(x, y, radius, 0, 2 * Math.PI);
   }
+  context.lineWidth = radius > 1.5 ? 2 : 0.6;
+  context.strokeStyle = halo;
+  context.stroke(path);
   context.fillStyle = colour;
   context.fill(path);
 }

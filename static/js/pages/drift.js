@@ -58,6 +58,7 @@ const kneeWords = h("p", { class: "small soft" });
 const figures = h("div", { class: "figures" });
 const warnings = h("div", { class: "warnings", role: "status", "aria-live": "polite" });
 const intervalBox = h("div");
+const solving = h("span", { class: "badge accent", role: "status", hidden: true }, "Solving again…");
 fill(find("#main"), stageElement(), sideElement());
 
 const history = new Plot(mainArea, { title: "Displacement", unit: "m", drag: "select" });
@@ -67,7 +68,7 @@ const fields = intervalFields(intervalBox, saveInterval);
 const refilter = newestOnly(askFilter, showAnswer, toastError);
 const resweep = newestOnly(askSweep, showSweep, (error) => showSweepProblem(error));
 const respectrum = newestOnly(askSpectra, showSpectra, () => undefined);
-const solver = new Solver(page, () => results.ready && !results.stale);
+const solver = new Solver(page, () => results.ready && !results.stale, (busy) => (solving.hidden = !busy));
 
 history.on("select", ({ from, to }) => saveInterval("pre_event", [from, to]));
 history.on("interval", ({ key, from, to, done }) => moveInterval(/** @type {IntervalName} */ (key), [from, to], done));
@@ -89,7 +90,7 @@ await reload().catch(toastError);
 
 function stageElement() {
   return h("div", { class: "stage" },
-    h("div", { class: "stage-bar" }, h("h1", {}, "Drift"), targetChoice.element, pointChoice.element, h("span", { class: "spring" }), axisChoice.element),
+    h("div", { class: "stage-bar" }, h("h1", {}, "Drift"), targetChoice.element, pointChoice.element, h("span", { class: "spring" }), solving, axisChoice.element),
     h("div", { class: "stage-body drift-stage" }, mainArea, lowerArea));
 }
 

@@ -57,6 +57,7 @@ const targetChoice = segmented({ label: "Target", choices: results.targets.map((
 const methodChoice = segmented({ label: "Method", choices: results.methods.map((name) => ({ value: name, name: methodName(name) })), value: method, onChange: chooseMethod });
 const compareSwitch = h("input", { type: "checkbox", checked: compared, onchange: () => compare(compareSwitch.checked) });
 const compareLabel = h("label", { class: "switch small" }, compareSwitch, "Compare methods");
+const solving = h("span", { class: "badge accent", role: "status", hidden: true }, "Solving again…");
 const facts = h("section", { class: "section", "aria-label": "This frame" });
 const doubtful = h("section", { class: "section", "aria-label": "Weak and lost frames" });
 const excluded = h("section", { class: "section", "aria-label": "Excluded frames" });
@@ -66,7 +67,7 @@ compareLabel.hidden = methodChoice.element.hidden = results.methods.length < 2;
 fill(
   find("#main"),
   h("div", { class: "stage" },
-    h("div", { class: "stage-bar" }, h("h1", {}, "Review"), stageChoice.element, targetChoice.element, h("span", { class: "spring" }), compareLabel, methodChoice.element),
+    h("div", { class: "stage-bar" }, h("h1", {}, "Review"), stageChoice.element, targetChoice.element, h("span", { class: "spring" }), solving, compareLabel, methodChoice.element),
     stageBody, transport, plotArea),
   h("aside", { class: "side", "aria-label": "Frame and overlay" }, facts, doubtful, excluded, layerList),
 );
@@ -74,7 +75,7 @@ const view = new FrameView(frameBox, new FrameLibrary(page.id, { size: [video.wi
 const scene = new SceneView(sceneBox, page.id);
 const player = new Player(transport);
 const plots = AXES.map((axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "review", drag: "seek", leastSpan: 0.002 }));
-const solver = new Solver(page, () => results.ready && !results.stale);
+const solver = new Solver(page, () => results.ready && !results.stale, (busy) => (solving.hidden = !busy));
 const exclusions = new ExclusionEditor(excluded, { store, solver, onSelection: showSelection, onJump: (frame) => player.go(frame) });
 
 listen();
