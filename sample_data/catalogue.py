@@ -332,7 +332,7 @@ SCENES: dict[str, Brief] = {
         post_event_s=5.0,
         ringing_s=2.0,
         recording=Recording(bit_rate=2_950_000, options={"preset": "slow", "g": "60"}),
-        survey=Survey(cloud_points=110_000, boards=12),
+        survey=Survey(cloud_points=700_000, boards=12),
     ),
 }
 """Name and brief of each scene."""

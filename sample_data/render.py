@@ -102,8 +102,8 @@ def _encoder_options(recording: Recording) -> dict[str, str]:
     if recording.codec == "libx265":
         # x265 numbers its threads by the machine; a fixed pool keeps the file the same everywhere.
         return {"preset": "ultrafast", "x265-params": "log-level=error:pools=2:frame-threads=1", **recording.options}
-    rate = str(recording.bit_rate)
-    return {"preset": "superfast", "maxrate": rate, "bufsize": rate, "g": "30", **recording.options}
+    # No buffer model (maxrate, bufsize): with several threads x264 keeps to it differently from run to run.
+    return {"preset": "superfast", "g": "30", **recording.options}
 
 
 def _ahead(source: Iterator[Bytes]) -> Iterator[Bytes]:

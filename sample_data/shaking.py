@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
+from scipy.signal import bilinear, lfilter
 
 Floats = NDArray[np.float64]
 Motion = Callable[[Floats], Floats]
@@ -100,22 +101,10 @@ def _ground_motion(time_s: Floats, quake: Earthquake, rng: np.random.Generator) 
 
 
 def _oscillator(base_m: Floats, quake: Earthquake, detune: float = 1.0) -> Floats:
-    """Return the relative displacement of a damped oscillator on a moving base (Newmark, average acceleration)."""
+    """Return the relative displacement of a damped oscillator on a moving base (average acceleration)."""
     omega = 2 * np.pi * quake.natural_hz * detune
-    acceleration = -np.gradient(np.gradient(base_m, _STEP_S), _STEP_S)
-    stiffness = omega**2 + 4 / _STEP_S**2 + 4 * quake.damping * omega / _STEP_S
-    u = v = 0.0
-    a = acceleration[0]
-    course = np.zeros(len(base_m))
-    for i in range(1, len(base_m)):
-        load = acceleration[i] + (4 * u / _STEP_S**2 + 4 * v / _STEP_S + a)
-        load += 2 * quake.damping * omega * (2 * u / _STEP_S + v)
-        new_u = load / stiffness
-        new_v = 2 * (new_u - u) / _STEP_S - v
-        a = acceleration[i] - 2 * quake.damping * omega * new_v - omega**2 * new_u
-        u, v = new_u, new_v
-        course[i] = u
-    return course
+    b, a = bilinear([-1.0, 0.0, 0.0], [1.0, 2 * quake.damping * omega, omega**2], fs=1 / _STEP_S)
+    return np.asarray(lfilter(b, a, base_m), dtype=np.float64)
 
 
 def _scale_to_peak(base: Floats, response: Floats, peak: Floats) -> Floats:

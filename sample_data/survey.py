@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -62,16 +63,17 @@ def write_cloud(scene: Scene, file: Path) -> None:
         walls, wall_greys = _wall_points(scene.body, rng, scene.survey.cloud_points // 12)
         points, greys = np.concatenate((points, walls)), np.concatenate((greys, wall_greys))
     points = points + rng.normal(0, [0.003, 0.003, 0.004], points.shape) + scene.survey.cloud_origin_m
+    order = np.lexsort((points[:, 0], np.floor(points[:, 1] / 0.5)))  # as a scanner sweeps; packs well
+    points, greys = points[order], greys[order]
     header = laspy.LasHeader(point_format=2, version="1.2")
-    header.scales = np.full(3, 0.001)
+    header.scales = np.full(3, 0.002)
     header.offsets = np.floor(points.min(axis=0))
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = points.T
-    wandering = greys * rng.normal(1, 0.12, len(greys)) + rng.normal(0, 9, len(greys))
-    cloud.intensity = np.clip(wandering * 90, 0, 65535).astype(np.uint16)
+    wandering = greys * rng.normal(1, 0.1, len(greys)) + 10 * np.sin(points[:, 0] / 9) + rng.normal(0, 7, len(greys))
+    cloud.intensity = (np.clip(wandering / 4, 0, 255)).astype(np.uint16) * 256
     for channel, name in zip((1.04, 1.0, 0.93), ("red", "green", "blue"), strict=True):
-        colour = greys * channel + rng.normal(0, 14, len(greys)) + 10 * np.sin(points[:, 0] / 9)
-        setattr(cloud, name, np.clip(colour, 0, 255).astype(np.uint16) * 257)
+        setattr(cloud, name, np.clip(wandering * channel, 0, 255).astype(np.uint16) * 256)
     cloud.write(str(file))
 
 
@@ -242,43 +244,60 @@ def _point(values: Floats, digits: int) -> Point:
 def _frame_on_ground(scene: Scene, camera: Camera) -> Floats:
     """Return (4, 2) where the corners of the reference frame lie on the ground, world metres."""
     width, height = scene.lens.image_size_px
-    return ground_under(scene, np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]]))
+    return ground_under(scene, np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]]))[:, :2]
 
 
 def ground_under(scene: Scene, raw_px: Floats) -> Floats:
-    """Return the places (n, 2) on level ground that the reference frame shows at raw pixels (n, 2)."""
+    """Return the places (n, 3) on the ground, relief included, that the reference frame shows at raw pixels (n, 2)."""
     R, C = scene.flight.pose(scene.frame_times()[_REFERENCE_FRAME])
     rays = scene.lens.rays_from_raw(raw_px)
     directions = np.column_stack((rays, np.ones(len(rays)))) @ R[0]
-    ground: Floats = (C[0] - directions * (C[0, 2] / directions[:, 2:]))[:, :2]
-    return ground
+    slope = directions[:, :2] / directions[:, 2:]
+    height = np.zeros(len(rays))
+    for _ in range(3):
+        plan = C[0, :2] + (height - C[0, 2])[:, None] * slope
+        height = scene.relief.at(plan)
+    return np.column_stack((plan, height))
 
 
 def _clicks(
     scene: Scene, camera: Camera, regions: list[Floats], rng: np.random.Generator, origin: Floats
 ) -> list[Correspondence]:
-    """Return 20 well spread pairs on free ground, one in each of 20 fields of the frame where there is any."""
+    """Return 20 well spread pairs on marks one can recognise on free ground: the best first, then the next best."""
+    marks = _marks_in_frame(scene, camera, regions)
+    frame = np.concatenate([of_field[:1] for of_field in marks] + [of_field[1:4] for of_field in marks])[:20]
+    ground = ground_under(scene, frame)[:, :2] + rng.normal(0, scene.survey.click_m, (len(frame), 2)) + origin[:2]
+    clicked = frame + rng.normal(0, scene.survey.click_px, (len(frame), 2))
+    return [
+        Correspondence(id=number, ground_m=_point(at, 3), frame_px=_point(px, 1))
+        for number, (at, px) in enumerate(zip(ground, clicked, strict=True), start=1)
+    ]
+
+
+def _marks_in_frame(scene: Scene, camera: Camera, regions: list[Floats]) -> list[Floats]:
+    """Return raw pixels (n, 2) of the clearest corners on flat free ground, for each of 5 by 4 fields of the frame."""
     width, height = scene.lens.image_size_px
-    time_s = float(scene.frame_times()[_REFERENCE_FRAME])
-    fields = (
-        [(i, j) for j in range(4) for i in range(5)] if width > height else [(i, j) for j in range(5) for i in range(4)]
-    )
-    across, down = (5, 4) if width > height else (4, 5)
-    pairs: list[Correspondence] = []
-    for attempt in range(40 * len(fields)):
-        i, j = fields[attempt % len(fields)]
-        wanted = (np.array([i, j]) + rng.uniform(0.12, 0.88, 2)) / [across, down] * [width - 1, height - 1]
-        if len(pairs) == 20 or (attempt < 20 * len(fields) and any(pair.id == 100 * i + j for pair in pairs)):
-            continue
-        plan = ground_under(scene, wanted[None])
-        world, _ = _tops(scene, plan)
-        frame = camera.project(world, time_s)[0]
-        if world[0, 2] > 0.3 or _inside(frame, regions) or not np.all((frame > 8) & (frame < [width - 9, height - 9])):
-            continue
-        ground = world[0, :2] + rng.normal(0, scene.survey.click_m, 2) + origin[:2]
-        clicked = frame + rng.normal(0, scene.survey.click_px, 2)
-        pairs.append(Correspondence(id=100 * i + j, ground_m=_point(ground, 3), frame_px=_point(clicked, 1)))
-    return [pair.model_copy(update={"id": number}) for number, pair in enumerate(pairs, start=1)]
+    luma, _ = camera.expose(float(scene.frame_times()[_REFERENCE_FRAME]))
+    columns, rows = np.linspace(8, width - 9, 6).astype(int), np.linspace(8, height - 9, 5).astype(int)
+    marks = []
+    for top, bottom in itertools.pairwise(rows):
+        for left, right in itertools.pairwise(columns):
+            part = cv2.GaussianBlur(luma[top:bottom, left:right], (0, 0), 1.5)
+            corners = cv2.goodFeaturesToTrack(part, 30, 0.02, width / 40)
+            found = np.empty((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64) + [left, top]
+            marks.append(found[_on_free_ground(scene, found, regions)])
+    return marks
+
+
+def _on_free_ground(scene: Scene, frame_px: Floats, regions: list[Floats]) -> NDArray[np.bool_]:
+    """Return (n,) whether raw pixels show ground that stays where it is: no object on it, no moving region over it."""
+    if len(frame_px) == 0:
+        return np.zeros(0, np.bool_)
+    world = ground_under(scene, frame_px)
+    beside = [(0.0, 0.0), (0.6, 0.0), (-0.6, 0.0), (0.0, 0.6), (0.0, -0.6)]
+    tops = np.max([_tops(scene, world[:, :2] + away)[0][:, 2] for away in beside], axis=0)
+    free = [not _inside(px, regions) for px in frame_px]
+    return np.asarray(free) & (tops < 0.3)
 
 
 def _inside(frame_px: Floats, regions: list[Floats]) -> bool:
