@@ -175,12 +175,12 @@ class MeasurementStore:
         row = self._db.execute(query, (recording, frame)).fetchone()
         return None if row is None else _measurement(row, list(self.reference(recording).targets_raw))
 
-    def load(self, recording: int) -> Recording:
-        """Return everything measured so far."""
+    def load(self, recording: int, after: int = -1) -> Recording:
+        """Return everything measured so far of the frames that come after a frame."""
         reference = self.reference(recording)
         names = list(reference.targets_raw)
-        query = "SELECT frame, time_s, measured FROM frames WHERE recording = ? ORDER BY frame"
-        frames = [_measurement(row, names) for row in self._db.execute(query, (recording,))]
+        query = "SELECT frame, time_s, measured FROM frames WHERE recording = ? AND frame > ? ORDER BY frame"
+        frames = [_measurement(row, names) for row in self._db.execute(query, (recording, after))]
         method = self._db.execute("SELECT method FROM recordings WHERE id = ?", (recording,)).fetchone()[0]
         stacked = {
             name: np.array([frame.targets_raw[name] for frame in frames]).reshape(

@@ -183,8 +183,35 @@ def _lens_of(folder: Path, project: Project, info: VideoInfo) -> Lens | None:
     return lens
 
 
-def _relief_of(folder: Path, project: Project, progress: Progress) -> Relief | None:
-    """Return the ground's relief, from an earlier run where the cloud and what decides the raster are the same."""
+@dataclass(frozen=True)
+class ReliefPlan:
+    """Which relief of the ground a project needs.
+
+    Attributes:
+        extent_m: west, south, east, north.
+        at_m: (2,) where heights count from the ground plane.
+        file: that keeps it, named by all that decides it.
+    """
+
+    extent_m: tuple[float, float, float, float]
+    at_m: Floats
+    file: Path
+
+    def make(self, cloud: Cloud, plane: GroundPlane) -> Relief:
+        """Make the relief from the cloud and keep it in place of earlier ones."""
+        relief = rasterise(cloud, plane, self.extent_m, self.at_m)
+        for old in self.file.parent.glob(f"*-{RELIEF_FILE}"):
+            old.unlink()
+        relief.save(self.file)
+        return relief
+
+
+def relief_plan(folder: Path, project: Project) -> ReliefPlan | None:
+    """Return which relief a project needs; None without a cloud or clicks.
+
+    Raises:
+        InputError: the cloud cannot be read.
+    """
     if project.inputs.cloud is None or not project.correspondences:
         return None
     cloud_file = folder / project.inputs.cloud
@@ -195,16 +222,16 @@ def _relief_of(folder: Path, project: Project, progress: Progress) -> Relief | N
     extent = (float(west), float(south), float(east), float(north))
     decided = json.dumps([video_identity(cloud_file), extent, below.tolist(), project.orthoimage.ground_z_m])
     name = hashlib.sha256(decided.encode()).hexdigest()[:16]
-    file = folder / "results" / f"{name}-{RELIEF_FILE}"
-    known = Relief.load(file)
-    if known is not None:
-        return known
-    cloud, plane = read_ground(folder, project, progress)
-    relief = rasterise(cloud, plane, extent, below)
-    for old in file.parent.glob(f"*-{RELIEF_FILE}"):
-        old.unlink()
-    relief.save(file)
-    return relief
+    return ReliefPlan(extent, below, folder / "results" / f"{name}-{RELIEF_FILE}")
+
+
+def _relief_of(folder: Path, project: Project, progress: Progress) -> Relief | None:
+    """Return the ground's relief, from an earlier run where the cloud and what decides the raster are the same."""
+    plan = relief_plan(folder, project)
+    if plan is None:
+        return None
+    known = Relief.load(plan.file)
+    return known if known is not None else plan.make(*read_ground(folder, project, progress))
 
 
 def read_ground(folder: Path, project: Project, progress: Progress = silent) -> tuple[Cloud, GroundPlane]:
