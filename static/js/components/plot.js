@@ -247,7 +247,7 @@ export class Plot extends Emitter {
 
   /** @param {number} low @param {number} high @returns {[number, number]} with air above and below */
   rangeY(low, high) {
-    if (low == null || high == null) return this.options.logY ? [1e-4, 1e-2] : [-0.01, 0.01];
+    if (low == null || high == null) [low, high] = this.options.logY ? [1e-4, 1e-2] : [-0.01, 0.01];
     if (this.options.logY) return this.rangeLog(low, high);
     const lacking = ((this.options.leastSpan ?? 1e-9) - (high - low)) / 2;
     const air = Math.max((high - low) * 0.08, lacking);

@@ -18,6 +18,17 @@ import { announce, toastError } from "../components/toast.js";
 /** @typedef {[frame: number, time_s: number, dx_m: number | null, dy_m: number | null, status: string]} Row */
 /** @typedef {{job: Job | null, resumable: boolean, frames_done: number, frames_total: number, message: string | null, preview: Record<string, Row[]>}} TrackState */
 
+/** Where each part of project.json is decided. @type {{path: string, step: import("../lib/types.js").StepName, name: string}[]} */
+const PLACES = [
+  { path: "inputs", step: "inputs", name: "Inputs" },
+  { path: "orthoimage", step: "orthoimage", name: "Orthoimage" },
+  { path: "correspondences", step: "correspondences", name: "Correspondences" },
+  { path: "targets", step: "regions", name: "Regions" },
+  { path: "moving_regions_px", step: "regions", name: "Regions" },
+  { path: "intervals_s", step: "drift", name: "Drift" },
+  { path: "drift", step: "drift", name: "Drift" },
+];
+
 const page = await openPage("track");
 const { store } = page;
 
@@ -191,7 +202,7 @@ function showControls() {
   const problems = store.state.problems ?? [];
   const done = results?.ready && !results.stale && !track.resumable;
   const notes = [
-    ...problems.map((problem) => note("bad", problem)),
+    ...problems.map(problemNote),
     job?.state === "failed" ? note("bad", job.message ?? "The measurement failed.") : null,
     problems.length === 0 && track.resumable ? note("info", stoppedWords()) : null,
     problems.length === 0 && results?.stale ? note("warn", store.state.steps.track.message || "The project has changed since these results were made.") : null,
@@ -199,6 +210,14 @@ function showControls() {
     ...(done ? (results?.summary?.warnings ?? []) : []).map((/** @type {string} */ warning) => note("warn", warning)),
   ];
   fill(controls, h("header", {}, h("h2", {}, "Measurement")), notes, buttons(Boolean(done)));
+}
+
+/** A problem of the project, with the page where it is put right. @param {string} problem "path: sentence" */
+function problemNote(problem) {
+  const place = PLACES.find(({ path }) => problem.startsWith(path));
+  const element = note("bad", problem);
+  if (place) element.append(h("a", { class: "note-link", href: stepUrl(page.id, place.step) }, place.name));
+  return element;
 }
 
 /** @param {boolean} done */
