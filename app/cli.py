@@ -11,12 +11,12 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from app.terminal import TerminalProgress
 from core.errors import Cancelled, InputError
@@ -88,7 +88,7 @@ def _run(options: argparse.Namespace) -> int:
         progress = TerminalProgress(sys.stdout)
         try:
             with _stoppable(progress) as cancel:
-                run_project(
+                summary = run_project(
                     folder,
                     workers=options.workers,
                     scheduler=options.scheduler,
@@ -106,8 +106,24 @@ def _run(options: argparse.Namespace) -> int:
             _refused(str(error))
             continue
         progress.close()
+        print("\n".join(_outcome(summary.summary)))
         print(f"Results: {folder / 'results'}")
     return 1 if failures else 0
+
+
+def _outcome(summary: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the lines that tell a person what `summary.json` says."""
+    for name, target in summary["targets"].items():
+        counts = ", ".join(f"{count} {status}" for status, count in target["counts"].items() if count)
+        yield f"{name}: {counts} of {summary['frames']} frames"
+        for axis in "xy":
+            low, high = (target[f"peak_{sign}_m"][axis] for sign in ("negative", "positive"))
+            peaks = [f"{1000 * peak['value']:+.1f} mm at {peak['time_s']:.2f} s" for peak in (low, high) if peak]
+            residual = (target.get("residual_m") or {}).get(axis)
+            rest = "" if residual is None else f", residual {1000 * residual:+.1f} mm"
+            if peaks:
+                yield f"  {axis}: peaks {' and '.join(peaks)}{rest}"
+    yield from (f"Warning: {warning}" for warning in summary["warnings"])
 
 
 def _check(options: argparse.Namespace) -> int:

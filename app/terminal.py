@@ -13,6 +13,8 @@ REDRAW_S = 0.1
 LOG_S = 10.0
 # The rate is that of the last seconds: a run that resumes or slows down is soon told rightly.
 RATE_WINDOW_S = 8.0
+# The stages whose units mean something to people.
+UNITS = {"measuring": "frames", "calibration": "pictures"}
 
 
 class TerminalProgress:
@@ -30,7 +32,8 @@ class TerminalProgress:
         self._smooth = "utf" in (out.encoding or "").lower()
         self._stage: str | None = None
         self._history: deque[tuple[float, int]] = deque()
-        self._written_at = 0.0
+        self._begun_at = self._written_at = 0.0
+        self._begun_with = 0
         self._last = (0, 0)
         self._line_open = False
 
@@ -41,7 +44,8 @@ class TerminalProgress:
             self.close()
             self._stage = stage
             self._history.clear()
-            self._written_at = now if total > 1 and not self._drawn_in_place else now - LOG_S
+            self._begun_at, self._begun_with = now, done
+            self._written_at = now - REDRAW_S if self._drawn_in_place else now
         self._last = (done, total)
         self._history.append((now, done))
         while len(self._history) > 2 and now - self._history[0][0] > RATE_WINDOW_S:
@@ -78,16 +82,23 @@ class TerminalProgress:
     def _line(self, width: int) -> str:
         done, total = self._last
         share = min(1.0, done / total) if total else 1.0
-        facts = f"{done}/{total}"
-        rate = self._rate()
-        if rate is not None:
-            facts += f"  {rate:.1f}/s"
-            if done < total:
-                facts += f"  {clock_text((total - done) / rate)} left"
-        label = f"{self._stage:<24}"
+        label = f"{self._stage:<16}"
         if width == 0:
-            return f"{label} {share:4.0%}  {facts}"
-        return f"{label} {self._bar(share, max(8, min(32, width - len(label) - 42)))} {share:4.0%}  {facts}"
+            return f"{label} {share:4.0%}  {self._facts()}".rstrip()
+        return f"{label} {self._bar(share, max(8, min(40, width - len(label) - 52)))} {share:4.0%}  {self._facts()}"
+
+    def _facts(self) -> str:
+        """How much, how fast, and how much longer; of a finished stage, how long it took."""
+        done, total = self._last
+        rate, unit = self._rate(), UNITS.get(self._stage or "")
+        facts = [f"{done}/{total} {unit}"] if unit else []
+        if unit and rate is not None:
+            facts.append(f"{rate:.1f} {unit}/s")
+        if done >= total:
+            facts.append(clock_text(self._history[-1][0] - self._begun_at))
+        elif rate is not None:
+            facts.append(f"{clock_text((total - done) / rate)} left")
+        return "  ".join(facts)
 
     def _bar(self, share: float, cells: int) -> str:
         full, empty = ("━", "─") if self._smooth else ("#", "-")
@@ -95,7 +106,10 @@ class TerminalProgress:
         return full * filled + empty * (cells - filled)
 
     def _rate(self) -> float | None:
+        """Units a second: of a finished stage over all of it, else of the last seconds."""
         (since, before), (now, done) = self._history[0], self._history[-1]
+        if done >= self._last[1]:
+            since, before = self._begun_at, self._begun_with
         return (done - before) / (now - since) if now > since and done > before else None
 
 

@@ -18,6 +18,18 @@ from core.project import read_project
 from tests import small_project
 
 Run = Callable[..., None]
+SUMMARY = {
+    "frames": 600,
+    "warnings": ["The roof height leaves 3 sigma."],
+    "targets": {
+        "roof": {
+            "peak_positive_m": {"x": {"value": 0.3097, "time_s": 11.3}, "y": None},
+            "peak_negative_m": {"x": {"value": -0.3599, "time_s": 9.87}, "y": None},
+            "residual_m": {"x": 0.0848, "y": None},
+            "counts": {"ok": 598, "weak": 0, "lost": 2, "excluded": 0},
+        }
+    },
+}
 
 
 @pytest.fixture(scope="module")
@@ -34,11 +46,12 @@ def engine(monkeypatch: pytest.MonkeyPatch) -> Callable[[Run], list[dict[str, An
     def install(run: Run) -> list[dict[str, Any]]:
         asked: list[dict[str, Any]] = []
 
-        def run_project(folder: Path, **options: Any) -> None:
+        def run_project(folder: Path, **options: Any) -> types.SimpleNamespace:
             asked.append({"folder": folder, **options})
             run(folder, **options)
+            return types.SimpleNamespace(summary=SUMMARY)
 
-        monkeypatch.setitem(sys.modules, "core.run", types.SimpleNamespace(run_project=run_project))
+        monkeypatch.setattr("core.run.run_project", run_project)
         return asked
 
     return install
@@ -63,7 +76,7 @@ def one_sentence(text: str) -> str:
 
 def test_run_hands_everything_to_the_engine(tmp_path: Path, engine: Any, capsys: pytest.CaptureFixture[str]) -> None:
     def run(folder: Path, *, progress: Any, **rest: Any) -> None:
-        progress("measure", 3, 3)
+        progress("measuring", 3, 3)
 
     asked = engine(run)
     project = project_at(tmp_path / "eq7")
@@ -72,7 +85,10 @@ def test_run_hands_everything_to_the_engine(tmp_path: Path, engine: Any, capsys:
     assert order["folder"] == project
     assert (order["workers"], order["scheduler"], order["fresh"]) == (2, "tcp://127.0.0.1:1", True)
     out, err = capsys.readouterr()
-    assert "measure" in out
+    assert "measuring" in out
+    assert "roof: 598 ok, 2 lost of 600 frames" in out
+    assert "x: peaks -359.9 mm at 9.87 s and +309.7 mm at 11.30 s, residual +84.8 mm" in out
+    assert "Warning: The roof height leaves 3 sigma." in out
     assert str(project / "results") in out
     assert err == ""
 
