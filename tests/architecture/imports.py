@@ -31,7 +31,6 @@ ORDER = (
     "patches",
     "ground",
     "roof_lines",
-    "roof_points",
     "motion",
     "flight",
     "self_calibration",
@@ -52,12 +51,13 @@ ORDER = (
     "figures",
     "report",
     "export",
+    "review",
     "create",
     "check",
     "run",
 )
 # Steps of the measurement: others may know what they return, only conductors call them.
-STEPS = {"georeference", "ground", "roof_lines", "roof_points", "motion", "flight", "drift", "validation"}
+STEPS = {"georeference", "ground", "roof_lines", "motion", "flight", "drift", "validation"}
 CONDUCTORS = {
     "following",
     "paper",
@@ -68,6 +68,7 @@ CONDUCTORS = {
     "solve",
     "figures",
     "report",
+    "review",
     "export",
     "check",
     "run",
@@ -165,13 +166,17 @@ def _order_problems(importer: str, imported: Import) -> Iterator[str]:
         yield f"only {', '.join(sorted(CONDUCTORS))} put steps together; {importer} takes {name or 'all'} from {step}"
 
 
+def javascript_imports(source: str) -> list[str]:
+    """Return what a JavaScript module imports, as it names it."""
+    return [first or second for first, second in _JS_IMPORT.findall(source)]
+
+
 def _javascript_problems(root: Path) -> Iterator[str]:
     scripts = root / "static" / "js"
     for file in sorted(scripts.rglob("*.js")):
         place = file.relative_to(root).as_posix()
         layer = file.relative_to(scripts).parts[0]
-        for groups in _JS_IMPORT.findall(file.read_text(encoding="utf-8")):
-            target = groups[0] or groups[1]
+        for target in javascript_imports(file.read_text(encoding="utf-8")):
             if not target.startswith((".", "/")) or not target.endswith((".js", ".mjs")):
                 yield f"{place}: imports {target}; name a file of this site, with its ending"
                 continue

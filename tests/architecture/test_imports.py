@@ -6,13 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.architecture.imports import imports_of, violations
+from tests.architecture.imports import ORDER, imports_of, violations
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_every_import_of_this_code_base_goes_the_right_way() -> None:
     assert violations(ROOT) == []
+
+
+def test_every_place_in_the_order_is_taken() -> None:
+    assert [name for name in ORDER if not (ROOT / "core" / f"{name}.py").exists()] == []
 
 
 def test_the_walk_saw_the_code_base() -> None:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.architecture.imports import javascript_imports
+
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 MAX_FILE_BYTES = 8 * 2**20
@@ -28,6 +30,18 @@ def test_no_committed_file_is_too_large() -> None:
 def test_no_committed_file_names_a_package_index() -> None:
     naming = [file.name for file in committed_files() if INDEX_ADDRESS.search(file.read_text("utf-8", "replace"))]
     assert naming == []
+
+
+def test_committed_pages_import_committed_modules() -> None:
+    committed = {file.resolve() for file in committed_files()}
+    scripts = [file for file in committed if file.suffix == ".js" and (ROOT / "static" / "js") in file.parents]
+    missing = [
+        f"{script.name}: {target}"
+        for script in scripts
+        for target in javascript_imports(script.read_text(encoding="utf-8"))
+        if target.startswith(".") and (script.parent / target).resolve() not in committed
+    ]
+    assert missing == []
 
 
 @pytest.mark.parametrize("name", ["requirements.lock", "requirements-test.lock", "package-lock.json"])
