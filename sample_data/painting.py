@@ -155,9 +155,17 @@ class RoofLook:
     @classmethod
     def random(cls, rng: Rng) -> RoofLook:
         """Return bright strips on dark, dark on bright, or one kind each way."""
-        looks = ((84, 205, 198), (186, 62, 70), (128, 215, 48), (150, 58, 222), (108, 182, 190))
-        sheet, along, across = looks[rng.integers(0, len(looks))]
-        return cls(*(value * rng.uniform(0.94, 1.06) for value in (sheet, along, across)))
+        # sheet, strips along, strips across, unlike
+        looks = (
+            (84, 205, 198, 0.12),
+            (186, 62, 70, 0.08),
+            (128, 215, 48, 0.10),
+            (150, 58, 222, 0.05),
+            (108, 182, 190, 0.14),
+        )
+        sheet, along, across, unlike = looks[rng.integers(0, len(looks))]
+        turn_out = rng.uniform(0.94, 1.06, 3)
+        return cls(sheet * turn_out[0], along * turn_out[1], across * turn_out[2], unlike)
 
 
 def paint_roof(
