@@ -9,7 +9,9 @@ from fastapi import Depends, Request
 
 from app.events import Hub
 from app.frames import FrameStore
+from app.growing import Growing
 from app.jobs import Jobs
+from app.outcome import Outcomes
 from app.places import Places
 from app.scene3d import Scene3D
 from app.sites import Sites
@@ -26,6 +28,8 @@ class Context:
     jobs: Jobs
     frames: FrameStore
     sites: Sites
+    outcomes: Outcomes
+    growing: Growing
     scene: Scene3D
 
 

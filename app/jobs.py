@@ -199,17 +199,19 @@ class Jobs:
         for job in active:
             self._await_end(job, _PATIENCE_S)
 
-    def go_on(self, workspace: Workspace, finishes: dict[str, Finish]) -> None:
-        """Go on with the tracking that ran when the last server of this workspace stopped."""
+    def go_on(self, workspace: Workspace, finishes: dict[str, Finish]) -> list[tuple[ProjectFolder, Job]]:
+        """Go on with the tracking that ran when the last server of this workspace stopped; return what was started."""
+        started = []
         for project in workspace.projects():
             note = read_json(project.results / JOB_FILE)
             if not isinstance(note, dict) or note.get("state") not in ("running", "interrupted"):
                 continue
             if note.get("kind") == _RESUMED:
                 parameters = {**(note.get("parameters") or {}), "fresh": False}
-                self.start(project, _RESUMED, parameters, finishes.get(_RESUMED))
+                started.append((project, self.start(project, _RESUMED, parameters, finishes.get(_RESUMED))))
             else:
                 (project.results / JOB_FILE).unlink(missing_ok=True)
+        return started
 
     def _await_end(self, job: Job, wait_s: float) -> None:
         watcher, process = self._watchers.get(job.id), self._processes.get(job.id)

@@ -14,7 +14,6 @@ import numpy as np
 from app.context import Context
 from app.frames import Fingerprint, fingerprint
 from app.store import ProjectFolder
-from core.cloud import ground_elevation
 from core.coordinates import Floats, OrthoGrid
 from core.errors import InputError
 from core.georeference import ReferenceFit, fit_reference
@@ -24,7 +23,6 @@ from core.video import VideoInfo, probe
 
 _KEPT = 64
 _fits: OrderedDict[Any, ReferenceFit | InputError] = OrderedDict()
-_elevations: OrderedDict[Any, float] = OrderedDict()
 _lock = threading.Lock()
 
 
@@ -93,21 +91,11 @@ def reference_fit(
 
 
 def _elevation(here: Context, folder: ProjectFolder, project: Project, pairs: tuple[Correspondence, ...]) -> Floats:
-    """Return (len(pairs),) of the ground clicks above the ground plane, from the cloud where it has been read."""
-    site = here.sites.site_if_read(folder, project)
-    if site is None:
+    """Return (len(pairs),) of the ground clicks above the ground, as the engine takes them from the cloud's relief."""
+    relief = here.sites.relief(folder, project)
+    if relief is None or not pairs:
         return np.zeros(len(pairs))
-    keys = [(site.key, pair.ground_m) for pair in pairs]
-    with _lock:
-        unknown = [key for key in dict.fromkeys(keys) if key not in _elevations]
-    if unknown:
-        found = ground_elevation(site.cloud, site.plane, np.array([ground_m for _, ground_m in unknown]))
-        with _lock:
-            _elevations.update(zip(unknown, found.tolist(), strict=True))
-            while len(_elevations) > 4096:
-                _elevations.popitem(last=False)
-    with _lock:
-        return np.array([_elevations.get(key, 0.0) for key in keys])
+    return relief.at(np.array([pair.ground_m for pair in pairs]))
 
 
 def H_plan_und(fit: ReferenceFit) -> Floats:

@@ -20,13 +20,15 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 from starlette.types import Scope
 
-from app.api import events, frames, geometry, inputs, orthoimage, projects, scene, viser
+from app.api import drift, events, frames, geometry, inputs, orthoimage, projects, results, scene, viser
 from app.context import Context, Here
 from app.errors import Missing, install_error_handlers
 from app.events import Hub
 from app.frames import FrameStore
+from app.growing import Growing
 from app.guards import LOOPBACK, Guard
 from app.jobs import Jobs
+from app.outcome import Outcomes
 from app.places import Places
 from app.scene3d import Scene3D
 from app.sites import Sites
@@ -62,12 +64,14 @@ def create_app(workspace: Path, roots: Sequence[Path] = ()) -> FastAPI:
         jobs=jobs,
         frames=FrameStore(),
         sites=Sites(jobs),
+        outcomes=Outcomes(),
+        growing=Growing(),
         scene=Scene3D(),
     )
     app = FastAPI(title="Rooftrack", lifespan=_life, docs_url=None, redoc_url=None, openapi_url=None)
     app.state.context = context
     install_error_handlers(app)
-    for part in (projects, events, inputs, frames, orthoimage, geometry, scene, viser):
+    for part in (projects, events, inputs, frames, orthoimage, geometry, results, drift, scene, viser):
         app.include_router(part.router)
     _add_pages(app)
     app.add_middleware(Guard)
@@ -88,7 +92,8 @@ def _tidy_and_go_on(context: Context) -> None:
         part.unlink(missing_ok=True)
     for folder in context.workspace.projects():
         folder.remove_parts()
-    context.jobs.go_on(context.workspace, {})
+    for folder, job in context.jobs.go_on(context.workspace, {"track": results.finish_track(context)}):
+        context.growing.follow(context, folder, job)
 
 
 def _stop(context: Context) -> None:

@@ -7,19 +7,22 @@ import json
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from app.errors import ApiError, NotYet
-from app.frames import fingerprint
+from app.frames import Fingerprint, fingerprint
 from app.jobs import Jobs
 from app.store import CACHE_FOLDER, ProjectFolder, read_json
 from core.cloud import Cloud, GroundPlane, fit_ground_plane, read_cloud
 from core.errors import InputError
 from core.progress import CancelToken, Progress
-from core.project import Project, write_atomically
+from core.project import Project, read_project, write_atomically
+from core.relief import Relief
+from core.run import relief_plan
 
 _FACTS = "cloud.json"
 _ARRAYS = ("points_m", "colour", "intensity")
@@ -41,6 +44,7 @@ class Sites:
     def __init__(self, jobs: Jobs) -> None:
         self._jobs = jobs
         self._sites: OrderedDict[str, Site] = OrderedDict()
+        self._reliefs: dict[str, Relief | None] = {}
         self._lock = threading.Lock()
 
     def facts(self, folder: ProjectFolder, project: Project, path: Path) -> dict[str, Any] | None:
@@ -85,17 +89,39 @@ class Sites:
         except (InputError, ApiError):
             return None
 
+    def relief(self, folder: ProjectFolder, project: Project) -> Relief | None:
+        """Return the ground's relief as the engine uses it; until a job has made it, the one of a moment ago."""
+        try:
+            plan = relief_plan(folder.folder, project)
+        except InputError:
+            return None
+        if plan is None:
+            return None
+        if plan.file.is_file():
+            self._reliefs[folder.id] = _relief(fingerprint(plan.file))
+        return self._reliefs.get(folder.id)
+
     def begin(self, folder: ProjectFolder, project: Project) -> None:
         """Have the cloud read if there is one and it has not been."""
         with contextlib.suppress(InputError, ApiError):
             path = folder.input_path("cloud", project)
-            if path is not None:
-                self.facts(folder, project, path)
+            plan = relief_plan(folder.folder, project)
+            known = path is not None and self.facts(folder, project, path) is not None
+            if path is not None and known and plan is not None and not plan.file.is_file():
+                self._read(folder, project, path, site_key(path, project))
 
     def _read(self, folder: ProjectFolder, project: Project, path: Path, key: str) -> None:
         if self._jobs.running(folder.id, "cloud") is None:
-            order = {"cloud": str(path), "key": key, "ground_z_m": project.orthoimage.ground_z_m}
-            self._jobs.start(folder, "cloud", order)
+            plan = relief_plan(folder.folder, project)
+            order = {
+                "cloud": str(path),
+                "key": key,
+                "ground_z_m": project.orthoimage.ground_z_m,
+                "relief": plan.file.name if plan else None,
+            }
+            latest = self._jobs.latest(folder.id, "cloud")
+            if latest is None or latest.state != "failed" or latest.parameters != order:
+                self._jobs.start(folder, "cloud", order)
 
 
 def site_key(path: Path, project: Project) -> str:
@@ -128,7 +154,16 @@ def read_site(folder: Path, order: dict[str, Any], progress: Progress, cancel: C
         _write_facts(cache, {"key": key, "error": str(error)})
         raise
     _write_facts(cache, {"key": key, "source": list(fingerprint(path)), **_described(cloud, plane)})
+    cancel.raise_if_cancelled()
+    wanted = relief_plan(folder, read_project(folder))
+    if wanted is not None and not wanted.file.is_file():
+        wanted.make(cloud, plane)
     return Site(key, cloud, plane)
+
+
+@lru_cache(maxsize=8)
+def _relief(file: Fingerprint) -> Relief | None:
+    return Relief.load(Path(file[0]))
 
 
 def _cached_cloud(cache: Path, path: Path, progress: Progress) -> Cloud:

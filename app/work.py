@@ -9,6 +9,7 @@ from typing import Any
 from app import calibrations, orthoimages, sites
 from app.worker import Reporter
 from core.progress import CancelToken
+from core.run import run_project
 
 Work = Callable[[Path, dict[str, Any], Reporter, CancelToken], Any]
 
@@ -29,7 +30,14 @@ def _calibrate(folder: Path, order: dict[str, Any], report: Reporter, cancel: Ca
     return calibrations.calibrate_lens(folder, order, report, cancel)
 
 
+def _track(folder: Path, order: dict[str, Any], report: Reporter, cancel: CancelToken) -> Any:
+    done = run_project(folder, fresh=bool(order.get("fresh")), progress=report, cancel=cancel)
+    return {"frames": done.frames, "frames_measured": done.frames_measured, "measuring_s": done.measuring_s}
+
+
 WORK: dict[str, Work] = {
+    "track": _track,
+    "report": _track,
     "calibrate": _calibrate,
     "cloud": _cloud,
     "orthoimage": _orthoimage,

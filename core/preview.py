@@ -86,23 +86,48 @@ def preview_target(luma: Luma, target: Target, fit: ReferenceFit) -> TargetPrevi
     """
     if target.kind == "points" or target.lines is None:
         return _preview_points(luma, target, fit)
-    lines = {
-        name: _preview_line(luma, getattr(target.lines, name), fit, f"targets.{target.name}.lines.{name}")
-        for name in LINE_NAMES
-    }
-    p1, p2 = (_crossing(lines[name], lines["T1"], target, fit) for name in ("L1", "L2"))
+    bands = {name: getattr(target.lines, name) for name in LINE_NAMES}
+    return preview_bands(luma, bands, fit, name=target.name, height_m=target.height_m, p1_p2_m=target.p1_p2_m)
+
+
+def preview_bands(
+    luma: Luma,
+    bands: Mapping[str, Band],
+    fit: ReferenceFit,
+    *,
+    name: str,
+    height_m: float | None = None,
+    p1_p2_m: float | None = None,
+) -> TargetPreview:
+    """Return what is found in the bands of a target, of which some may still be missing.
+
+    Args:
+        luma: the reference frame.
+        bands: any of L1, L2 and T1.
+        fit: of the clicked pairs.
+        name: of the target, for messages.
+        height_m: of the target, where known.
+        p1_p2_m: distance of P1 and P2, where known, to compare with.
+    """
+    lines = {line: _preview_line(luma, band, fit, f"targets.{name}.lines.{line}") for line, band in bands.items()}
+    p1, p2 = (_crossing(lines.get(line), lines.get("T1"), height_m, fit) for line in ("L1", "L2"))
     message = ""
-    if p1 and p2 and target.p1_p2_m is not None and p1.world_m is not None and p2.world_m is not None:
+    if p1 and p2 and p1_p2_m is not None and p1.world_m is not None and p2.world_m is not None:
         distance_m = float(np.linalg.norm(p1.world_m - p2.world_m))
-        message = f"P1-P2 measures {distance_m:.3f} m; {target.p1_p2_m:.3f} m is given."
+        message = f"P1-P2 measures {distance_m:.3f} m; {p1_p2_m:.3f} m is given."
     return TargetPreview(lines, np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2)), p1, p2, message)
+
+
+def band_outline(band: Band) -> Floats:
+    """Return the outline of a band in plan metres, (34, 2), close enough together to bend with the lens."""
+    corners = _corners(np.array([band.from_m, band.to_m]), band.width_m)
+    return np.concatenate([_between(*corners[:2]), _between(*corners[2:])])
 
 
 def _preview_line(luma: Luma, band: Band, fit: ReferenceFit, name: str) -> LinePreview:
     ends = np.array([band.from_m, band.to_m])
     band_plan = _corners(ends, band.width_m)
-    sides = np.concatenate([_between(*band_plan[:2]), _between(*band_plan[2:])])
-    band_raw = fit.raw_from_plan(sides)
+    band_raw = fit.raw_from_plan(band_outline(band))
     none = LinePreview(band_plan, band_raw, np.empty((0, 2, 2)), np.empty((0, 2, 2)), None, None, None, "")
     try:
         edges_raw = _edges(luma, ends, band, fit, name)
@@ -160,21 +185,19 @@ def _between(start: Floats, end: Floats) -> Floats:
     return np.asarray(start + np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None] * (end - start))
 
 
-def _crossing(line: LinePreview, across: LinePreview, target: Target, fit: ReferenceFit) -> PointPreview | None:
-    if line.midline_plan is None or across.midline_plan is None:
+def _crossing(
+    line: LinePreview | None, across: LinePreview | None, height_m: float | None, fit: ReferenceFit
+) -> PointPreview | None:
+    if line is None or across is None or line.midline_plan is None or across.midline_plan is None:
         return None
     (a, b), (c, d) = line.midline_plan, across.midline_plan
     directions = np.column_stack([b - a, c - d])
     if abs(np.linalg.det(directions)) < 1e-9:
         return None
     plan = a + np.linalg.solve(directions, c - a)[0] * (b - a)
-    return _point(plan, target, fit)
-
-
-def _point(plan: Floats, target: Target, fit: ReferenceFit) -> PointPreview:
     world = None
-    if fit.pose is not None and target.height_m is not None:
-        world = read_only(fit.world_from_plan(plan[None], target.height_m)[0])
+    if fit.pose is not None and height_m is not None:
+        world = read_only(fit.world_from_plan(plan[None], height_m)[0])
     return PointPreview(read_only(plan), read_only(fit.raw_from_plan(plan[None])[0]), world)
 
 

@@ -5,11 +5,11 @@ Fit of the clicked pairs, points led from one frame of reference to another, and
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from fastapi import APIRouter
-from pydantic import ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from app import orthoimages
 from app.answers import plain, points
@@ -24,14 +24,15 @@ from core.camera import Pose
 from core.coordinates import Floats, apply_homography
 from core.errors import InputError
 from core.georeference import COVERAGE_CELLS, ReferenceFit
-from core.preview import TargetPreview, preview_target
-from core.project import Correspondence, Project, Target
+from core.preview import TargetPreview, preview_bands, preview_target
+from core.project import LINE_NAMES, Band, Correspondence, Project, Target
 
 router = APIRouter(prefix="/api/projects/{project_id}")
 
 FrameName = Literal["raw", "und", "plan", "ortho", "world"]
 # Enough for every mark on a page; more would be somebody's mistake.
 _MOST_POINTS = 20_000
+Drawable = TypeVar("Drawable", bound=BaseModel)
 
 
 class Pairs(Body):
@@ -187,9 +188,9 @@ def _ortho_grid(here: Context, folder: ProjectFolder, project: Project) -> Any:
 
 
 class Drawn(Body):
-    """A target as it is being drawn."""
+    """A target as it is being drawn: some of its bands may still be missing."""
 
-    target: Target
+    target: dict[str, Any]
 
 
 @router.post("/lines/preview")
@@ -198,7 +199,20 @@ def preview(wanted: Drawn, folder: Folder, here: Here) -> dict[str, Any]:
     project = folder.load().project
     found = _fit_for_points(here, folder, project)
     luma = luma_of(fingerprint(folder.require_input("video", project)), project.reference_frame)
-    return _previewed(preview_target(luma, wanted.target, found))
+    lines = wanted.target.get("lines")
+    if isinstance(lines, dict) and 0 < sum(lines.get(name) is not None for name in LINE_NAMES) < len(LINE_NAMES):
+        bands = {name: _valid(Band, lines[name], f"lines.{name}") for name in LINE_NAMES if lines.get(name)}
+        return _previewed(preview_bands(luma, bands, found, name=str(wanted.target.get("name", "target"))))
+    return _previewed(preview_target(luma, _valid(Target, wanted.target, "target"), found))
+
+
+def _valid(model: type[Drawable], given: Any, path: str) -> Drawable:
+    try:
+        return model.model_validate(given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join([path, *(str(part) for part in first["loc"])])
+        raise Invalid(f"{place}: {first['msg'].removeprefix('Value error, ')}.", path=place) from None
 
 
 def _previewed(seen: TargetPreview) -> dict[str, Any]:
