@@ -30,11 +30,32 @@ export function drawIntervals(plot, u) {
     g.fillStyle = plot.faded(interval.colour, 0.6);
     g.fillRect(from, top, scale, height);
     g.fillRect(to - scale, top, scale, height);
+  }
+  g.restore();
+}
+
+/**
+ * Name the intervals, over the grid.
+ * @param {Plot} plot
+ * @param {import("../../vendor/uplot/uPlot.esm.js")} u
+ */
+export function drawIntervalNames(plot, u) {
+  const { left, top, width } = u.bbox;
+  const scale = devicePixelRatio;
+  const g = u.ctx;
+  g.save();
+  g.font = `600 ${11 * scale}px Inter, system-ui, sans-serif`;
+  g.textBaseline = "top";
+  g.textAlign = "left";
+  for (const interval of plot.intervals) {
+    const from = Math.max(u.valToPos(interval.from, "x", true), left);
+    const to = Math.min(u.valToPos(interval.to, "x", true), left + width);
+    const wide = g.measureText(interval.label).width;
+    if (to - from < wide + 14 * scale) continue;
+    g.fillStyle = plot.colour("--surface");
+    g.fillRect(from + 4 * scale, top + 3 * scale, wide + 8 * scale, 16 * scale);
     g.fillStyle = plot.colour(interval.colour);
-    g.font = `600 ${11 * scale}px Inter, system-ui, sans-serif`;
-    g.textBaseline = "top";
-    g.textAlign = "left";
-    if (to - from > g.measureText(interval.label).width + 12 * scale) g.fillText(interval.label, Math.max(from, left) + 7 * scale, top + 5 * scale);
+    g.fillText(interval.label, from + 8 * scale, top + 5 * scale);
   }
   g.restore();
 }

@@ -8,7 +8,7 @@ import { fixed } from "../lib/format.js";
 import { onTheme } from "../lib/theme.js";
 import { colourOf, faded } from "./palette.js";
 import { attachGestures } from "./plot-gestures.js";
-import { drawIntervals, drawStatuses, drawVerticals, IntervalHandles } from "./plot-marks.js";
+import { drawIntervalNames, drawIntervals, drawStatuses, drawVerticals, IntervalHandles } from "./plot-marks.js";
 
 /**
  * @typedef {object} Trace one curve
@@ -205,7 +205,7 @@ export class Plot extends Emitter {
       series: [{}, ...this.traces.map((trace) => this.series(trace))],
       hooks: {
         drawClear: [(u) => drawIntervals(this, u)],
-        draw: [(u) => drawStatuses(this, u), (u) => drawVerticals(this, u)],
+        draw: [(u) => drawStatuses(this, u), (u) => drawIntervalNames(this, u), (u) => drawVerticals(this, u)],
         setCursor: [() => this.writeValues()],
         setScale: [(_, key) => key === "x" && queueMicrotask(() => this.place())],
       },

@@ -19,8 +19,9 @@ import { toastError } from "../components/toast.js";
 /** @typedef {import("../components/histories.js").History} History */
 /** @typedef {import("../components/interval-fields.js").IntervalName} IntervalName */
 /** @typedef {{dx: (number | null)[], dy: (number | null)[]}} Pair */
-/** @typedef {{time_s: number[], raw: Pair, filtered: Pair, filtered_pre_event_rms_m?: {dx: number | null, dy: number | null} | null, warnings: string[]}} DriftAnswer */
-/** @typedef {{corners_hz: number[], rms_m: Pair, unfiltered_rms_m?: {dx: number | null, dy: number | null}, knee_hz: number | null, message?: string}} Sweep */
+/** @typedef {{dx: number, dy: number}} Rms */
+/** @typedef {{time_s: number[], raw: Pair, filtered: Pair, pre_event_rms_m: Rms | null, filtered_pre_event_rms_m: Rms | null, warnings: string[]}} DriftAnswer */
+/** @typedef {{corners_hz: number[], rms_m: Pair, knee_hz: number | null}} Sweep */
 /** @typedef {{frequency_hz: number[], dx_m: number[], dy_m: number[]}} Spectrum */
 
 const LOWEST_HZ = 0.05;
@@ -180,9 +181,8 @@ function showSweep(newest) {
   sweepPlot.setTraces(traces, [newest.corners_hz, newest.rms_m.dx, newest.rms_m.dy]);
   kneeButton.hidden = newest.knee_hz === null;
   if (newest.knee_hz !== null) kneeButton.textContent = `Take the knee, ${fixed(newest.knee_hz, 3)} Hz`;
-  kneeWords.textContent = newest.message ?? (newest.knee_hz === null ? "The curve has no knee: no corner frequency stands out." : "");
-  kneeWords.hidden = kneeWords.textContent === "";
-  showFigures();
+  kneeWords.textContent = newest.knee_hz === null ? "The curve has no knee: no corner frequency stands out." : `Above ${fixed(newest.knee_hz, 3)} Hz a higher corner hardly makes the pre-event quieter.`;
+  kneeWords.hidden = false;
   markCorner();
 }
 
@@ -221,8 +221,9 @@ function onOneAxis(spectra, key) {
 }
 
 function markCorner() {
-  const corner = { at: corner_hz, label: `corner ${fixed(corner_hz, 3)} Hz`, colour: "--accent" };
-  const knee = sweep?.knee_hz ? [{ at: sweep.knee_hz, label: `knee ${fixed(sweep.knee_hz, 3)} Hz`, colour: "--series-4" }] : [];
+  const atKnee = Math.abs(corner_hz - (sweep?.knee_hz ?? 0)) < CORNER_STEP_HZ / 2;
+  const corner = { at: corner_hz, label: `${atKnee ? "corner at the knee," : "corner"} ${fixed(corner_hz, 3)} Hz`, colour: "--accent" };
+  const knee = sweep?.knee_hz && !atKnee ? [{ at: sweep.knee_hz, label: `knee ${fixed(sweep.knee_hz, 3)} Hz`, colour: "--series-4" }] : [];
   sweepPlot.setVerticals([corner, ...knee]);
   sweepPlot.head = corner_hz;
   spectrumPlot.setVerticals([corner]);
@@ -231,7 +232,7 @@ function markCorner() {
 function showFigures() {
   const figure = (/** @type {number | null | undefined} */ value_m, /** @type {string} */ name) => h("div", {}, h("span", { class: "value" }, millimetres(value_m, 1)), h("span", { class: "name" }, name));
   const key = axis === "x" ? "dx" : "dy";
-  const before = sweep?.unfiltered_rms_m?.[key];
+  const before = answer?.pre_event_rms_m?.[key];
   const after = answer?.filtered_pre_event_rms_m?.[key];
   const exact = results.summary?.targets?.[target]?.pre_event_rms_m?.[axis];
   fill(figures,

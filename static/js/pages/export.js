@@ -2,7 +2,7 @@
 
 import { get, post, projectPath } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
-import { centimetres, fixed, millimetres, size } from "../lib/format.js";
+import { centimetres, fixed, millimetres, plural, size } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { stepUrl } from "../components/header.js";
@@ -34,9 +34,7 @@ const FILE_WORDS = [
   { test: /^summary\.json$/, words: "Peaks, residual, fits, settings" },
   { test: /^report\.html$/, words: "Report to read and print" },
   { test: /^orthoimage\.tif$/, words: "Orthoimage, georeferenced" },
-  { test: /\.(png|svg|pdf)$/, words: "Figure" },
 ];
-const NOT_FOR_PEOPLE = /^frames\.sqlite|^\./;
 
 const page = await openPage("export");
 let results = await whenMeasured(page, "Track the video first; the result is then compared with GPS and exported from here.");
@@ -143,22 +141,21 @@ function showGps() {
     validation?.gps && h("div", { class: "figures" },
       figure(rms ? millimetres(rms.x, 1) : "–", "RMS error, east"),
       figure(rms ? millimetres(rms.y, 1) : "–", "RMS error, north"),
-      figure(lagWords(validation), "clock lag, applied")),
-    validation?.gps ? h("p", { class: "small soft" }, lagSentence(validation.lag_s)) : null,
+      figure(lagWords(validation.lag_s), "clock lag, applied")),
+    validation?.gps ? h("p", { class: "small soft" }, lagSentence(validation)) : null,
   );
 }
 
-/** @param {Validation} given */
-function lagWords({ lag_s, lag_sigma_s }) {
-  if (lag_s === null) return "–";
-  return `${lag_s > 0 ? "+" : ""}${fixed(lag_s, 3)}${lag_sigma_s ? ` ± ${fixed(lag_sigma_s, 3)}` : ""} s`;
+/** @param {number | null} lag_s */
+function lagWords(lag_s) {
+  return lag_s === null ? "–" : `${lag_s > 0 ? "+" : ""}${fixed(lag_s, 3)} s`;
 }
 
-/** @param {number | null} lag_s */
-function lagSentence(lag_s) {
-  if (lag_s === null) return "The clock lag could not be told.";
+/** @param {Validation} given */
+function lagSentence({ lag_s, lag_sigma_s }) {
+  if (lag_s === null || !lag_sigma_s) return "The clock lag could not be told.";
   const direction = lag_s > 0 ? "behind" : "ahead of";
-  return `The GPS clock runs ${direction} the video by ${fixed(Math.abs(lag_s), 3)} s, found from the motion itself.`;
+  return `The GPS clock runs ${direction} the video by ${fixed(Math.abs(lag_s), 3)} s (± ${fixed(lag_sigma_s * 1000, 1)} ms), found from the motion itself.`;
 }
 
 function showTable() {
@@ -171,7 +168,7 @@ function comparisonTable(rows) {
   const cells = (/** @type {Quantity} */ quantity, /** @type {"x" | "y"} */ of) => {
     const row = rows.find((entry) => entry.quantity === quantity && entry.axis === of);
     if (row === undefined) return [h("td", { class: "number group faint", colspan: 3 }, "–")];
-    const percent = row.error_percent === null || row.error_percent === undefined ? null : h("span", { class: "faint" }, ` (${fixed(row.error_percent, 1)} %)`);
+    const percent = row.error_percent === null ? null : h("span", { class: "faint" }, ` (${fixed(row.error_percent, row.error_percent < 100 ? 1 : 0)} %)`);
     return [h("td", { class: "number group" }, fixed(row.video_m * 100, 2)), h("td", { class: "number" }, fixed(row.gps_m * 100, 2)), h("td", { class: "number strong" }, fixed(row.error_m * 100, 2), percent)];
   };
   return h("table", { class: "table comparison" },
@@ -194,10 +191,21 @@ function summaryTable() {
 }
 
 function showFiles() {
-  const files = results.files.filter(({ name }) => !NOT_FOR_PEOPLE.test(name)).sort((a, b) => rank(a) - rank(b));
+  const files = [...results.files].sort((a, b) => rank(a) - rank(b));
   const report = files.some(({ name }) => name === "report.html");
   const make = h("button", { type: "button", class: "button small", onclick: makeReport }, icon("refresh", "small"), report ? "Remake" : "Make the report");
-  fill(fileBox, h("header", {}, h("h2", {}, "Files"), make), results.stale ? note("warn", "The project has changed since these files were made; update the results on the Track page.") : null, reportJob.element, h("ul", { class: "file-rows" }, files.map(fileRow)));
+  fill(fileBox, h("header", {}, h("h2", {}, "Files"), make), results.stale ? note("warn", "The project has changed since these files were made; update the results on the Track page.") : null, reportJob.element, h("ul", { class: "file-rows" }, files.filter((file) => !isFigure(file)).map(fileRow)), figureRows(files.filter(isFigure)));
+}
+
+/** @param {ResultFile} file */
+function isFigure({ name }) {
+  return /\.(png|svg|pdf)$/.test(name);
+}
+
+/** @param {ResultFile[]} figures */
+function figureRows(figures) {
+  if (figures.length === 0) return null;
+  return h("details", { class: "more-files" }, h("summary", {}, plural(figures.length, "figure")), h("ul", { class: "file-rows" }, figures.map(fileRow)));
 }
 
 /** @param {ResultFile} file */
@@ -209,13 +217,13 @@ function rank({ name }) {
 
 /** @param {ResultFile} file */
 function fileRow(file) {
-  const url = `/api/${projectPath(page.id, `files/${encodeURIComponent(file.name)}`)}`;
+  const url = `/api/${projectPath(page.id, `files/${file.name.split("/").map(encodeURIComponent).join("/")}`)}`;
   const main = file.name === `${target}.csv`;
   const words = FILE_WORDS.find(({ test }) => test.test(file.name))?.words ?? "";
   const open = file.name.endsWith(".html") ? h("a", { class: "button quiet small icon-only", href: url, target: "_blank", rel: "noopener", "aria-label": `Open ${file.name}`, title: "Open" }, icon("expand", "small")) : null;
   return h("li", {},
     icon("file"),
-    h("span", { class: "file-words" }, h("span", { class: "file-name" }, file.name), h("span", { class: "small faint" }, words)),
+    h("span", { class: "file-words" }, h("span", { class: "file-name", title: file.name }, file.name.replace(/^figures\//, "")), words ? h("span", { class: "small faint" }, words) : null),
     h("span", { class: "number small faint" }, size(file.size)),
     open,
     h("a", { class: `button small icon-only ${main ? "primary" : "quiet"}`, href: url, download: file.name, "aria-label": `Download ${file.name}`, title: `Download ${file.name}`, "data-main": main }, icon("download", "small")));

@@ -63,7 +63,8 @@ const doubtful = h("section", { class: "section", "aria-label": "Weak and lost f
 const excluded = h("section", { class: "section", "aria-label": "Excluded frames" });
 const layerList = h("section", { class: "section", "aria-label": "Overlay" });
 targetChoice.element.hidden = results.targets.length < 2;
-compareLabel.hidden = methodChoice.element.hidden = results.methods.length < 2;
+methodChoice.element.hidden = compareSwitch.disabled = results.methods.length < 2;
+compareLabel.title = compareSwitch.disabled ? "Track with the other method too; then both can be compared." : "";
 fill(
   find("#main"),
   h("div", { class: "stage" },
