@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from core.camera import PoseFit, project
 from core.coordinates import Bools, Floats
 from core.drift import filter_warnings
+from core.flight import SmoothFlight
 from core.lens import Lens
 from core.measurements import Recording
 from core.motion import LineSet, fit_line
@@ -224,9 +225,7 @@ def summary_of(results: Results, check: GpsCheck | None, warnings: list[str]) ->
         "reference_fit": _reference_summary(solution),
         "ground_fit": _ground_summary(solution.ground),
         "self_calibration": _calibration_summary(solution.self_calibration),
-        "flight": None
-        if solution.flight is None
-        else {"noise_m": _axes(solution.flight.noise_m), "jerk_m_s2_5": _axes(solution.flight.jerk)},
+        "flight": _flight_summary(solution.flight),
         "sha256": dict(results.sha256),
         "settings": results.project.model_dump(mode="json"),
     }
@@ -290,8 +289,11 @@ def _calibration_summary(calibration: SelfCalibration | None) -> dict[str, Any] 
     }
 
 
-def _axes(values: Floats) -> dict[str, float]:
-    return dict(zip("xyz", values.tolist(), strict=True))
+def _flight_summary(flight: SmoothFlight | None) -> dict[str, Any] | None:
+    """Return, per coordinate, how the camera's path was modelled: noise of a frame's pose, and how it moves."""
+    if flight is None:
+        return None
+    return {axis: dataclasses.asdict(model) for axis, model in zip("xyz", flight.models, strict=True)}
 
 
 # --- figures ---------------------------------------------------------------------------------------------------------
@@ -477,9 +479,12 @@ def _ground_facts(solution: Solution, ground: Mapping[str, Any]) -> list[Fact]:
             Fact("residual of a median frame", f"{ground['rms_px']:.3f} px RMS"),
         ]
     flight = solution.flight
-    if flight is not None and np.isfinite(flight.noise_m).all():
-        before, after = flight.noise_m, np.nanmedian(flight.sigma_m, axis=0)
-        words = [f"{1e3 * b:.1f} → {1e3 * a:.1f} mm in {axis}" for axis, b, a in zip("xyz", before, after, strict=True)]
+    if flight is not None:
+        kept_m = np.median(flight.sigma_m, axis=0)
+        words = [
+            f"{1e3 * model.noise_m:.1f} → {1e3 * kept:.1f} mm in {axis}"
+            for axis, model, kept in zip("xyz", flight.models, kept_m, strict=True)
+        ]
         facts.append(Fact("camera position noise, single pose → smooth flight", ", ".join(words)))
     return facts
 

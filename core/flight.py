@@ -1,26 +1,49 @@
 """Smooth flight: a hovering camera's position cannot jump, although its rotation can.
 
-Each coordinate of the camera centre is a body pushed by random jerks and seen through noisy poses. How strongly it is
-pushed, and how noisy the poses are, comes from the record's own spectrum; a fixed strength would follow noise in calm
-air and cut corners in gusts. The smoothest path for these two numbers is a banded least-squares problem.
+Each coordinate of the camera centre is a smooth path seen through noisy poses. How smooth the path is (how steeply its
+spectrum falls), how strongly it is pushed, and how noisy the poses are come from the record's own spectrum; a fixed
+strength would follow noise in calm air and cut corners in gusts. The most probable path is a penalised spline.
 
-Source: Whittaker (1923) for the smoother; Whittle (1953) for the likelihood of a spectrum.
+Source: Whittle (1953) for the likelihood of a spectrum; Eilers & Marx (1996) for the splines.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.linalg import solveh_banded
+from scipy.interpolate import BSpline
+from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize
 
 from core.coordinates import Floats
 
+# The derivative of the path that may be white: 3 for a path pushed by random jerks, more for calmer air.
+ORDERS = (2, 3, 4, 5)
+DEGREE = 5
+# Knots this far apart follow motion up to 4 Hz, far above what a hovering drone's position does.
+KNOT_S = 0.125
 # Beyond this many standard deviations of its frame, a pose is trusted less instead of followed.
 OUTLYING = 3.5
-# Columns of the inverse computed to learn how much noise the smoothed path keeps.
-PROBES = 48
+LEAST_FRAMES = 24
+# No pose is better than a micrometre; the equations of a record without any noise could not be solved.
+LEAST_NOISE_M = 1e-6
+
+
+@dataclass(frozen=True)
+class FlightModel:
+    """How one coordinate of the path moves and how noisily it is seen.
+
+    Attributes:
+        noise_m: of one frame, as it acts on slow motion: the square root of its spectral density times the frame rate.
+        order: of the derivative that is white.
+        push: root spectral density of that derivative, m s^-order Hz^-1/2.
+    """
+
+    noise_m: float
+    order: int
+    push: float
 
 
 @dataclass(frozen=True)
@@ -30,108 +53,126 @@ class SmoothFlight:
     Attributes:
         value_m: (F, K) smoothed.
         sigma_m: (F, K) one standard deviation of what noise remains.
-        noise_m: (K,) estimated noise of a median frame's pose.
-        jerk: (K,) estimated root spectral density of the jerk, m s^-2.5.
+        models: of the K coordinates.
     """
 
     value_m: Floats
     sigma_m: Floats
-    noise_m: Floats
-    jerk: Floats
+    models: tuple[FlightModel, ...]
+
+    @property
+    def noise_m(self) -> Floats:
+        """(K,) noise of a single frame's pose."""
+        return np.array([model.noise_m for model in self.models])
 
 
-def smooth_flight(time_s: Floats, centre_m: Floats, sigma_m: Floats) -> SmoothFlight:
-    """Return the camera's path freed of the noise of single poses.
+def smooth_flight(time_s: Floats, centre_m: Floats, sigma_m: Floats) -> SmoothFlight | None:
+    """Return the camera's path freed of the noise of single poses, or None where the record is too short to tell.
 
     Args:
         time_s: (F,) increasing.
         centre_m: (F, K) coordinates; nan where a frame gave none.
         sigma_m: (F, K) relative size of each frame's noise; its common scale is estimated.
     """
-    columns = [_smooth_column(time_s, centre_m[:, k], sigma_m[:, k]) for k in range(centre_m.shape[1])]
-    values, sigmas, noises, jerks = zip(*columns, strict=True)
-    return SmoothFlight(np.stack(values, 1), np.stack(sigmas, 1), np.array(noises), np.array(jerks))
+    seen = np.isfinite(centre_m).all(axis=1) & np.isfinite(sigma_m).all(axis=1)
+    if seen.sum() < LEAST_FRAMES:
+        return None
+    values, sigmas, models = [], [], []
+    for coordinate, sigma in zip(centre_m.T, sigma_m.T, strict=True):
+        model = estimate_flight(time_s[seen], coordinate[seen])
+        each = model.noise_m * sigma[seen] / float(np.median(sigma[seen]))
+        value, kept = _smooth(time_s, time_s[seen], coordinate[seen], each, model)
+        values.append(value)
+        sigmas.append(kept)
+        models.append(model)
+    return SmoothFlight(np.stack(values, 1), np.stack(sigmas, 1), tuple(models))
 
 
-def _smooth_column(time_s: Floats, value: Floats, sigma: Floats) -> tuple[Floats, Floats, float, float]:
-    seen = np.isfinite(value) & np.isfinite(sigma)
-    if seen.sum() < 24:
-        return value.copy(), sigma.copy(), float("nan"), float("nan")
-    noise, jerk = estimate_noise(time_s[seen], value[seen])
-    each = np.where(seen, noise * sigma / float(np.median(sigma[seen])), np.inf)
-    centred = np.where(seen, value, 0.0) - float(value[seen].mean())
-    smooth, kept = _whittaker(time_s, np.where(seen, centred, 0.0), each, jerk)
-    return smooth + float(value[seen].mean()), kept, noise, jerk
+def estimate_flight(time_s: Floats, value_m: Floats) -> FlightModel:
+    """Return the model under which a coordinate's record is most likely.
 
-
-def estimate_noise(time_s: Floats, value: Floats) -> tuple[float, float]:
-    """Return the white noise (standard deviation) and the root spectral density of the jerk of one coordinate.
-
-    Third differences turn the path's steep spectrum into a mild one: white jerk becomes white, white noise becomes
-    blue; the two are told apart by maximum likelihood of the periodogram.
+    Third differences turn the path's steep spectrum into a mild one, so that little leaks from slow motion into fast.
+    Compression and gimbal make the noise of neighbouring frames alike: it is a first-order autoregression.
     """
     step_s = float(np.median(np.diff(time_s)))
     even = np.arange(time_s[0], time_s[-1] + step_s / 2, step_s)
-    differences = np.diff(np.interp(even, time_s, value), n=3)
+    differences = np.diff(np.interp(even, time_s, value_m), n=3)
     scale = 1.4826 * float(np.median(np.abs(differences))) + 1e-15
     differences = np.clip(differences, -6.0 * scale, 6.0 * scale)  # a single wild pose must not decide
     window = np.hanning(len(differences) + 2)[1:-1]
     power = np.abs(np.fft.rfft(differences * window))[1:] ** 2 / (window**2).sum()
     frequency = np.fft.rfftfreq(len(differences), step_s)[1:]
-    white = (2.0 * np.sin(np.pi * frequency * step_s)) ** 6
-    # A sampled triple integral of white jerk, differenced three times, has the variance 11/20 step^5 and is nearly
-    # white; sinc^6 is its shape.
-    pushed = step_s**5 * np.sinc(frequency * step_s) ** 6
+    turn = 2.0 * np.pi * frequency * step_s
+    difference = (2.0 * np.sin(turn / 2.0)) ** 6
 
-    def cost(logs: Floats) -> float:
-        model = np.exp(2 * logs[0]) * white + np.exp(2 * logs[1]) * pushed
-        return float((np.log(model) + power / model).sum())
+    def noise_shape(memory: float) -> Floats:
+        return np.asarray((1.0 - memory) ** 2 / (1.0 - 2.0 * memory * np.cos(turn) + memory**2))
 
-    high = frequency > 0.6 * frequency[-1]
-    first_noise = np.sqrt(max(float((power[high] / white[high]).mean()), 1e-18))
-    low = frequency < 0.1 * frequency[-1]
-    first_jerk = np.sqrt(max(float((power[low] / pushed[low]).mean()), 1e-18))
-    start = np.log([first_noise, first_jerk])
-    best = minimize(cost, start, method="Nelder-Mead", options={"xatol": 0.01, "fatol": 0.01}).x
-    return float(np.exp(best[0])), float(np.exp(best[1]))
+    def fit(order: int) -> tuple[float, FlightModel]:
+        path = (2.0 * np.pi * frequency) ** (-2.0 * order) / step_s
+
+        def cost(unknown: Floats) -> float:
+            noise = np.exp(2.0 * unknown[0]) * noise_shape(0.95 / (1.0 + np.exp(-unknown[2])))
+            model = difference * (noise + np.exp(2.0 * unknown[1]) * path)
+            return float((np.log(model) + power / model).sum())
+
+        fast = frequency > 0.3 * frequency[-1]
+        noise = 0.5 * np.log(max(float((power[fast] / difference[fast]).mean()), 1e-20))
+        slow = frequency <= max(0.5, frequency[1])
+        push = 0.5 * np.log(max(float(np.median((power / difference / path)[slow])), 1e-20))
+        start = np.array([noise, push, 0.0])
+        best = minimize(cost, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02, "maxiter": 400})
+        return float(best.fun), FlightModel(max(float(np.exp(best.x[0])), LEAST_NOISE_M), order, float(np.exp(best.x[1])))
+
+    return min((fit(order) for order in ORDERS), key=lambda found: found[0])[1]
 
 
-def _whittaker(time_s: Floats, value: Floats, sigma: Floats, jerk: float) -> tuple[Floats, Floats]:
-    """Return the most probable path under white jerk and the noise it keeps, both (F,)."""
-    penalty = _jerk_penalty(time_s, jerk)
-    weight = 1.0 / sigma**2
-    robust = np.ones_like(weight)
-    smooth = value
+def _smooth(
+    time_s: Floats, seen_s: Floats, value_m: Floats, sigma_m: Floats, model: FlightModel
+) -> tuple[Floats, Floats]:
+    """Return the most probable path at `time_s` (F,) and the noise it keeps, from values (N,) at `seen_s`."""
+    spans = max(DEGREE + 2, int(np.ceil((time_s[-1] - time_s[0]) / KNOT_S)))
+    knot_s = float(time_s[-1] - time_s[0]) / spans
+    knots = time_s[0] + knot_s * np.arange(-DEGREE, spans + DEGREE + 1)
+    mean = float(value_m.mean())
+    penalty = _difference_penalty(spans + DEGREE, model.order) * (knot_s / (model.push * knot_s**model.order) ** 2)
+    basis: Any = BSpline.design_matrix(seen_s, knots, DEGREE)
+    weight, coefficients = 1.0 / sigma_m**2, np.zeros(spans + DEGREE)
+    factor = penalty
     for _ in range(4):
+        normal = (basis.T @ basis.multiply(weight[:, None])).todia()
         banded = penalty.copy()
-        banded[-1] += weight * robust
-        smooth = solveh_banded(banded, weight * robust * value)
-        ratio = np.abs(value - smooth) / sigma
-        robust = np.minimum(1.0, OUTLYING / np.maximum(ratio, 1e-12)) ** 2
-    return smooth, _kept_noise(banded)
+        for offset, diagonal in zip(normal.offsets, normal.data, strict=True):
+            if 0 <= offset <= DEGREE:
+                banded[DEGREE - offset] += diagonal
+        factor = cholesky_banded(banded)
+        coefficients = cho_solve_banded((factor, False), basis.T @ (weight * (value_m - mean)))
+        ratio = np.abs(value_m - mean - basis @ coefficients) / sigma_m
+        weight = np.minimum(1.0, OUTLYING / np.maximum(ratio, 1e-12)) ** 2 / sigma_m**2
+    every: Any = BSpline.design_matrix(np.clip(time_s, knots[DEGREE], knots[-DEGREE - 1]), knots, DEGREE)
+    return every @ coefficients + mean, _kept_noise(factor, every)
 
 
-def _jerk_penalty(time_s: Floats, jerk: float) -> Floats:
-    """Return sum of (third derivative)^2 step / jerk^2 as an upper banded matrix (4, F)."""
-    count = len(time_s)
-    rows = np.arange(count - 3)
-    nodes = time_s[rows[:, None] + np.arange(4)]
-    gaps = nodes[:, :, None] - nodes[:, None, :] + np.eye(4)
-    coefficients = 6.0 / gaps.prod(axis=2)  # third derivative of the cubic through four points
-    coefficients *= np.sqrt((nodes[:, 3] - nodes[:, 0]) / 3.0)[:, None] / jerk
-    banded = np.zeros((4, count))
-    for i in range(4):
-        for j in range(i, 4):
-            np.add.at(banded[3 - (j - i)], rows + j, coefficients[:, i] * coefficients[:, j])
+def _difference_penalty(count: int, order: int) -> Floats:
+    """Return D'D of the differences of an order as an upper banded matrix (DEGREE + 1, count)."""
+    D = np.diff(np.eye(min(count, 4 * DEGREE + 1)), n=order, axis=0)
+    small = D.T @ D
+    middle = len(small) // 2
+    banded = np.zeros((DEGREE + 1, count))
+    for offset in range(order + 1):
+        diagonal = np.diagonal(small, offset)
+        full = np.full(count - offset, diagonal[middle])
+        ends = min(len(diagonal) // 2, len(full) // 2)
+        full[:ends], full[len(full) - ends :] = diagonal[:ends], diagonal[len(diagonal) - ends :]
+        banded[DEGREE - offset, offset:] = full
     return banded
 
 
-def _kept_noise(banded: Floats) -> Floats:
-    """Return the square root of the inverse's diagonal, from probes that lie closer at the ends."""
-    count = banded.shape[1]
-    ends = np.arange(min(12, count))
-    probes = np.unique(np.concatenate([ends, count - 1 - ends, np.linspace(0, count - 1, PROBES).astype(int)]))
-    unit = np.zeros((count, len(probes)))
-    unit[probes, np.arange(len(probes))] = 1.0
-    variance = solveh_banded(banded, unit)[probes, np.arange(len(probes))]
+def _kept_noise(factor: Floats, basis: Any) -> Floats:
+    """Return the standard deviation of the path at the rows of a basis, from a few probes interpolated between."""
+    count = basis.shape[0]
+    ends = np.arange(min(15, count))
+    probes = np.unique(np.concatenate([ends, count - 1 - ends, np.linspace(0, count - 1, 64).astype(int)]))
+    chosen = basis[probes].toarray()
+    variance = (chosen * cho_solve_banded((factor, False), chosen.T).T).sum(axis=1)
     return np.asarray(np.interp(np.arange(count), probes, np.sqrt(np.maximum(variance, 0.0))))

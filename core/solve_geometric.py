@@ -137,15 +137,14 @@ def _assessed(points: Floats, poses: PoseFit, focal: float) -> Ground:
 
 def _smoothed(recording: Recording, ground: Ground, lens: Lens) -> tuple[SmoothFlight | None, Ground]:
     """Smooth the camera's path and fit each frame's rotation anew about the smoothed centre."""
-    if ground.usable.sum() < 30:
-        return None, ground
     covariance = (
         np.linalg.pinv(ground.known_poses.normal, hermitian=True) * (ground.known_poses.sigma**2)[:, None, None]
     )
     sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2)[:, 3:], 1e-18))
     centre = np.where(ground.usable[:, None], ground.known_poses.centre_m, np.nan)
     flight = smooth_flight(recording.time_s, centre, np.where(ground.usable[:, None], sigma, np.nan))
-    path = np.where(np.isfinite(flight.value_m), flight.value_m, ground.known_poses.centre_m)
+    if flight is None:
+        return None, ground
     rays = lens.rays_from_raw(recording.ground_raw)
     poses = fit_poses(
         rays,
@@ -154,7 +153,7 @@ def _smoothed(recording: Recording, ground: Ground, lens: Lens) -> tuple[SmoothF
         ground.known_poses,
         iterations=3,
         robust=False,
-        fixed_centre_m=path,
+        fixed_centre_m=flight.value_m,
     )
     poses = replace(poses, weight=ground.known_poses.weight, sigma=ground.known_poses.sigma)
     return flight, replace(ground, poses=poses, H_plan_ray=plan_homographies(poses.R, poses.centre_m))
