@@ -130,15 +130,17 @@ class Scene3D:
         """Stop viser."""
         with self._lock:
             if self._server is not None:
-                self._server.stop()
+                with contextlib.redirect_stdout(io.StringIO()):
+                    self._server.stop()
                 self._server = None
 
     def look(self, at_m: Floats, size_m: float) -> None:
         """Set where new viewers look from: south of the middle, half-way up."""
         with self._lock:
             camera = self._started().initial_camera
-            middle = at_m - self.origin_m
-            camera.position = tuple(middle + np.array([0.3, -1.2, 0.9]) * size_m)
+            # Half-way up to the camera in the sky, so that ground, building and flight are in view together.
+            middle = at_m - self.origin_m + np.array([0.0, 0.0, 0.4 * size_m])
+            camera.position = tuple(middle + np.array([0.4, -2.0, 0.8]) * size_m)
             camera.look_at = tuple(middle)
             camera.up = (0.0, 0.0, 1.0)
 

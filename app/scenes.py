@@ -13,6 +13,7 @@ from app import orthoimages
 from app.context import Context
 from app.errors import ApiError
 from app.frames import fingerprint, scaled_to
+from app.outcome import Solved, recorded_of
 from app.reference import reference_fit
 from app.scene3d import MAX_POINTS, CameraView, CloudView, DrapeView, GroundView
 from app.sites import Site
@@ -23,6 +24,8 @@ from core.coordinates import Floats
 from core.errors import InputError
 from core.georeference import ReferenceFit
 from core.project import Project
+from core.review import camera_at, camera_path, lines_at_rest, moved_lines
+from core.run import relief_plan
 
 Colour = Literal["rgb", "intensity", "height"]
 
@@ -138,29 +141,75 @@ def _show_flight(
 ) -> None:
     """Show the camera at a frame, its path, and the roof lines as they have moved."""
     frame = project.reference_frame if view.frame is None else view.frame
-    assert fit.pose is not None
-    ground_z_m = 0.0 if site is None else float(site.plane.z_m(fit.origin_m))
-    base = np.array([*fit.origin_m, ground_z_m])
-    pose = fit.pose
-    key = (fingerprint(folder.require_input("video", project)), frame, pose.centre_m.tobytes(), pose.R.tobytes())
+    solved = _solved_if_measured(here, folder, project)
+    above = np.array([0.0, 0.0, _ground_z_m(folder, project, site)])
+    place = None if solved is None else _place_of(solved, frame)
+    pose, path = _pose_and_path(fit, solved, place)
+    video = fingerprint(folder.require_input("video", project))
+    key = (video, frame, pose.centre_m.tobytes(), pose.R.tobytes(), None if path is None else path.tobytes())
     if not here.scene.has("camera", key):
-        here.scene.set_camera(_camera(here, folder, project, frame, fit, pose, base), None, key)
+        moved = Pose(pose.R, pose.centre_m + above)
+        camera = _camera(here, folder, project, frame, fit, moved)
+        here.scene.set_camera(camera, None if path is None else path + above, key)
+    if solved is None or place is None:
+        here.scene.drop("lines")
+        return
+    lines_key = (solved, place, view.exaggeration)
+    if not here.scene.has("lines", lines_key):
+        _show_lines(here, solved, place, view.exaggeration, above, lines_key)
+
+
+def _solved_if_measured(here: Context, folder: ProjectFolder, project: Project) -> Solved | None:
+    """Return the solution of a finished measurement; the scene waits for no running one."""
+    if not recorded_of(folder, project, project.method).finished:
+        return None
+    try:
+        return here.outcomes.solved(folder, project)
+    except (InputError, ApiError):
+        return None
+
+
+def _ground_z_m(folder: ProjectFolder, project: Project, site: Site | None) -> float:
+    """Return the world height from which the engine counts heights."""
+    plan = relief_plan(folder.folder, project)
+    return 0.0 if site is None or plan is None else float(site.plane.z_m(plan.at_m))
+
+
+def _place_of(solved: Solved, frame: int) -> int | None:
+    place = int(np.searchsorted(solved.recording.frame, frame))
+    found = place < len(solved.recording.frame) and solved.recording.frame[place] == frame
+    return place if found else None
+
+
+def _pose_and_path(fit: ReferenceFit, solved: Solved | None, place: int | None) -> tuple[Pose, Floats | None]:
+    """Return the camera, centre in absolute metres above the ground, and its path; the reference's where unknown."""
+    assert fit.pose is not None
+    pose = Pose(fit.pose.R, fit.pose.centre_m + np.append(fit.origin_m, 0.0))
+    if solved is None:
+        return pose, None
+    measured = camera_at(solved.solution, place) if place is not None else None
+    return measured or pose, camera_path(solved.solution)
+
+
+def _show_lines(here: Context, solved: Solved, place: int, exaggeration: float, above: Floats, key: Any) -> None:
+    moved: dict[str, Floats] = {}
+    resting: dict[str, Floats] = {}
+    for target in solved.inputs.project.targets:
+        rest = lines_at_rest(solved.recording, solved.solution, target)
+        now = moved_lines(rest, solved.solution, target.name, place, exaggeration)
+        resting |= {f"{target.name}/{line}": ends + above for line, ends in rest.items()}
+        moved |= {f"{target.name}/{line}": ends + above for line, ends in now.items()}
+    here.scene.set_lines(moved, resting, key)
 
 
 def _camera(
-    here: Context,
-    folder: ProjectFolder,
-    project: Project,
-    frame: int,
-    fit: ReferenceFit,
-    pose: Pose,
-    base: Floats,
+    here: Context, folder: ProjectFolder, project: Project, frame: int, fit: ReferenceFit, pose: Pose
 ) -> CameraView:
     picture = scaled_to(here.frames.frame(folder.require_input("video", project), frame), _PICTURE_WIDTH)
     width, height = fit.lens.image_size_px
     return CameraView(
         R=pose.R,
-        centre_m=pose.centre_m + base,
+        centre_m=pose.centre_m,
         vertical_fov_rad=float(2.0 * np.arctan(height / 2.0 / fit.lens.focal_px[1])),
         aspect=width / height,
         picture=picture,
