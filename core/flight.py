@@ -22,11 +22,15 @@ from core.coordinates import Floats
 # The derivative of the path that may be white: 3 for a path pushed by random jerks, more for calmer air.
 ORDERS = (2, 3, 4, 5)
 DEGREE = 5
+# Knots to a period of the fastest motion that stands out of the noise: more would say nothing, and could not be solved.
+KNOTS_PER_PERIOD = 8
 # Knots this far apart follow motion up to 4 Hz, far above what a hovering drone's position does.
-KNOT_S = 0.125
+CLOSEST_KNOT_S = 0.125
 # Beyond this many standard deviations of its frame, a pose is trusted less instead of followed.
 OUTLYING = 3.5
 LEAST_FRAMES = 24
+# A gap of so many frames may be bridged by a straight line where the model is estimated.
+BRIDGED_FRAMES = 5.5
 # No pose is better than a micrometre; the equations of a record without any noise could not be solved.
 LEAST_NOISE_M = 1e-6
 
@@ -39,11 +43,13 @@ class FlightModel:
         noise_m: of one frame, as it acts on slow motion: the square root of its spectral density times the frame rate.
         order: of the derivative that is white.
         push: root spectral density of that derivative, m s^-order Hz^-1/2.
+        fastest_hz: where the path sinks below the noise.
     """
 
     noise_m: float
     order: int
     push: float
+    fastest_hz: float
 
 
 @dataclass(frozen=True)
@@ -75,17 +81,28 @@ def smooth_flight(time_s: Floats, centre_m: Floats, sigma_m: Floats) -> SmoothFl
         sigma_m: (F, K) relative size of each frame's noise; its common scale is estimated.
     """
     seen = np.isfinite(centre_m).all(axis=1) & np.isfinite(sigma_m).all(axis=1)
-    if seen.sum() < LEAST_FRAMES:
+    unbroken = np.flatnonzero(seen)[_longest_run(time_s[seen])]
+    if len(unbroken) < LEAST_FRAMES:
         return None
     values, sigmas, models = [], [], []
     for coordinate, sigma in zip(centre_m.T, sigma_m.T, strict=True):
-        model = estimate_flight(time_s[seen], coordinate[seen])
+        model = estimate_flight(time_s[unbroken], coordinate[unbroken])
         each = model.noise_m * sigma[seen] / float(np.median(sigma[seen]))
         value, kept = _smooth(time_s, time_s[seen], coordinate[seen], each, model)
         values.append(value)
         sigmas.append(kept)
         models.append(model)
     return SmoothFlight(np.stack(values, 1), np.stack(sigmas, 1), tuple(models))
+
+
+def _longest_run(time_s: Floats) -> slice:
+    """Return the longest part without a gap: a straight line over many frames would pass for a calm flight."""
+    if len(time_s) < 2:
+        return slice(0, len(time_s))
+    breaks = np.flatnonzero(np.diff(time_s) > BRIDGED_FRAMES * np.median(np.diff(time_s))) + 1
+    edges = np.concatenate([[0], breaks, [len(time_s)]])
+    longest = int(np.argmax(np.diff(edges)))
+    return slice(int(edges[longest]), int(edges[longest + 1]))
 
 
 def estimate_flight(time_s: Floats, value_m: Floats) -> FlightModel:
@@ -100,7 +117,7 @@ def estimate_flight(time_s: Floats, value_m: Floats) -> FlightModel:
     scale = 1.4826 * float(np.median(np.abs(differences))) + 1e-15
     differences = np.clip(differences, -6.0 * scale, 6.0 * scale)  # a single wild pose must not decide
     window = np.hanning(len(differences) + 2)[1:-1]
-    power = np.abs(np.fft.rfft(differences * window))[1:] ** 2 / (window**2).sum()
+    power = np.abs(np.fft.rfft(differences * window))[1:] ** 2 / (window**2).sum() + 1e-30
     frequency = np.fft.rfftfreq(len(differences), step_s)[1:]
     turn = 2.0 * np.pi * frequency * step_s
     difference = (2.0 * np.sin(turn / 2.0)) ** 6
@@ -120,23 +137,42 @@ def estimate_flight(time_s: Floats, value_m: Floats) -> FlightModel:
         noise = 0.5 * np.log(max(float((power[fast] / difference[fast]).mean()), 1e-20))
         slow = frequency <= max(0.5, frequency[1])
         push = 0.5 * np.log(max(float(np.median((power / difference / path)[slow])), 1e-20))
-        start = np.array([noise, push, 0.0])
-        best = minimize(cost, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02, "maxiter": 400})
-        return float(best.fun), FlightModel(max(float(np.exp(best.x[0])), LEAST_NOISE_M), order, float(np.exp(best.x[1])))
+        # The memory goes from 0.1 to 0.3 in the first step; from zero the method would hardly move it.
+        simplex = np.array([noise, push, -2.0]) + np.vstack([np.zeros(3), np.diag([0.5, 0.5, 1.5])])
+        best: Any = minimize(
+            cost,
+            simplex[0],
+            method="Nelder-Mead",
+            options={"initial_simplex": simplex, "xatol": 0.02, "fatol": 0.02, "maxiter": 400},
+        )
+        return float(best.fun), _model(order, best.x, step_s, float(even[-1] - even[0]))
 
     return min((fit(order) for order in ORDERS), key=lambda found: found[0])[1]
+
+
+def _model(order: int, logarithms: Floats, step_s: float, duration_s: float) -> FlightModel:
+    """Return the model of an order; what moves slower than once in a record cannot be told from rest."""
+    noise = max(float(np.exp(logarithms[0])), LEAST_NOISE_M)
+    density = noise * np.sqrt(step_s)
+    fastest_hz = float(np.exp((logarithms[1] - np.log(density)) / order) / (2.0 * np.pi))
+    fastest_hz = max(fastest_hz, 1.0 / duration_s)
+    return FlightModel(noise, order, float(density * (2.0 * np.pi * fastest_hz) ** order), fastest_hz)
 
 
 def _smooth(
     time_s: Floats, seen_s: Floats, value_m: Floats, sigma_m: Floats, model: FlightModel
 ) -> tuple[Floats, Floats]:
     """Return the most probable path at `time_s` (F,) and the noise it keeps, from values (N,) at `seen_s`."""
-    spans = max(DEGREE + 2, int(np.ceil((time_s[-1] - time_s[0]) / KNOT_S)))
+    widest_s = max(CLOSEST_KNOT_S, 1.0 / (KNOTS_PER_PERIOD * model.fastest_hz))
+    spans = max(DEGREE + 2, int(np.ceil((time_s[-1] - time_s[0]) / widest_s)))
     knot_s = float(time_s[-1] - time_s[0]) / spans
     knots = time_s[0] + knot_s * np.arange(-DEGREE, spans + DEGREE + 1)
     mean = float(value_m.mean())
     penalty = _difference_penalty(spans + DEGREE, model.order) * (knot_s / (model.push * knot_s**model.order) ** 2)
-    basis: Any = BSpline.design_matrix(seen_s, knots, DEGREE)
+    # The last time may come to lie beyond the last knot by rounding.
+    within = np.clip(time_s, knots[DEGREE], knots[-DEGREE - 1])
+    every: Any = BSpline.design_matrix(within, knots, DEGREE)
+    basis = every[np.searchsorted(time_s, seen_s)]
     weight, coefficients = 1.0 / sigma_m**2, np.zeros(spans + DEGREE)
     factor = penalty
     for _ in range(4):
@@ -144,12 +180,11 @@ def _smooth(
         banded = penalty.copy()
         for offset, diagonal in zip(normal.offsets, normal.data, strict=True):
             if 0 <= offset <= DEGREE:
-                banded[DEGREE - offset] += diagonal
+                banded[DEGREE - offset, : len(diagonal)] += diagonal  # shorter where the last frames were not seen
         factor = cholesky_banded(banded)
         coefficients = cho_solve_banded((factor, False), basis.T @ (weight * (value_m - mean)))
         ratio = np.abs(value_m - mean - basis @ coefficients) / sigma_m
         weight = np.minimum(1.0, OUTLYING / np.maximum(ratio, 1e-12)) ** 2 / sigma_m**2
-    every: Any = BSpline.design_matrix(np.clip(time_s, knots[DEGREE], knots[-DEGREE - 1]), knots, DEGREE)
     return every @ coefficients + mean, _kept_noise(factor, every)
 
 
