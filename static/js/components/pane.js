@@ -98,6 +98,7 @@ export class Pane extends Emitter {
   setImage(image) {
     const same = this.image !== null && image !== null && this.image.width === image.width && this.image.height === image.height;
     this.image = image;
+    this.element.dataset.picture = image === null ? "" : `${image.width}x${image.height}`;
     if (image !== null && !same) this.fit();
     this.invalidate();
   }
@@ -214,8 +215,8 @@ export class Pane extends Emitter {
       const device = entry.devicePixelContentBoxSize?.[0];
       const { width, height } = entry.contentRect;
       if (width === 0 || height === 0) return;
-      this.canvas.width = device?.inlineSize ?? Math.round(width * ratio);
-      this.canvas.height = device?.blockSize ?? Math.round(height * ratio);
+      this.canvas.width = devicePixels(width * ratio, device?.inlineSize);
+      this.canvas.height = devicePixels(height * ratio, device?.blockSize);
       const before = this.size;
       this.size = [width, height];
       if (this.#fitted) this.fit();
@@ -322,3 +323,6 @@ export class Pane extends Emitter {
     this.emit("hover", { point: this.cursor, id });
   }
 }
+
+/** What the browser says it lays out, where that is about right (an emulated screen tells CSS px). @param {number} about @param {number | undefined} told */
+const devicePixels = (about, told) => (told !== undefined && Math.abs(told - about) <= 1 ? told : Math.round(about));

@@ -1,0 +1,72 @@
+"""What a person's hand does in an image pane: zoom to a place with the wheel, click it, drag it; and where it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from playwright.sync_api import Locator, Page, expect
+
+from core.coordinates import Floats
+
+# The pane's own figures: factor exp(0.0016 * wheel), image px centres at +0.5 (see static/js).
+_WHEEL_SPEED = 0.0016
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How a picture lies in a window: `window = scale * (image + 0.5) + corner`, CSS px."""
+
+    scale: float
+    corner: Floats
+
+    def window(self, image: Floats) -> Floats:
+        """Return where (..., 2) image px lie in the window."""
+        placed: Floats = self.scale * (np.asarray(image, dtype=np.float64) + 0.5) + self.corner
+        return placed
+
+    def image(self, window: Floats) -> Floats:
+        """Return which image px lie at (..., 2) window px."""
+        found: Floats = (np.asarray(window, dtype=np.float64) - self.corner) / self.scale - 0.5
+        return found
+
+
+def fitted(page: Page, pane: Locator, size: tuple[int, int]) -> Placement:
+    """Show the whole picture of (width, height) and return how it lies then."""
+    pane.focus()
+    page.keyboard.press("0")
+    box = pane.bounding_box()
+    assert box is not None
+    scale = min(box["width"] / size[0], box["height"] / size[1])
+    drawn(page, pane, scale)
+    middle = np.array([box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
+    return Placement(scale, middle - scale * np.array(size) / 2)
+
+
+def zoomed(page: Page, pane: Locator, size: tuple[int, int], image: Floats, wheel: float = 2000.0) -> Placement:
+    """Turn the wheel over a place of the picture, as a person does before a careful click."""
+    before = fitted(page, pane, size)
+    pointer = np.round(before.window(image))
+    page.mouse.move(*pointer)
+    ratio = page.evaluate("devicePixelRatio")  # Chromium takes the wheel's way in device px
+    page.mouse.wheel(0, -wheel * ratio)
+    scale = before.scale * np.exp(_WHEEL_SPEED * wheel)
+    drawn(page, pane, scale)
+    return Placement(scale, pointer - scale * (before.image(pointer) + 0.5))
+
+
+def drawn(page: Page, pane: Locator, scale: float) -> None:
+    """Wait until a pane says that it shows its picture at a scale, and has drawn it so."""
+    expect(pane.locator(".pane-readout")).to_contain_text(f"{100 * scale:.{1 if scale < 0.1 else 0}f} %")
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def click_at(page: Page, pane: Locator, size: tuple[int, int], image: Floats) -> None:
+    """Zoom to a place and click it, to a fraction of a pixel."""
+    page.mouse.click(*np.round(zoomed(page, pane, size, image).window(image)))
+
+
+def centre_of(mark: Locator) -> Floats:
+    """Return where the middle of an SVG mark is in the window, CSS px, from its own transform."""
+    where = mark.evaluate("g => { const m = g.getScreenCTM(); return [m.e, m.f]; }")
+    return np.array(where)

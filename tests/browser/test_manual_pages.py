@@ -1,0 +1,432 @@
+"""Projects, inputs, orthoimage, correspondences and regions as a person uses them, on the shipped sample."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import urllib.request
+from io import BytesIO
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Page, expect
+
+from core.lens import read_lens
+from core.project import read_project
+from tests.browser.hands import centre_of, click_at, fitted, zoomed
+from tests.browser.live import ask, chromium, free_port, serving, watched
+
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "sample"
+FRAME_SIZE = read_lens(SAMPLE / "lens.yaml").image_size_px
+WITHIN_PX = 0.5
+# A click falls on a whole CSS pixel, and the wheel has zoomed to six or more of them per pixel of the picture.
+CLICK_PX = 0.15
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    """A workspace and the address of the server over it."""
+    workspace = tmp_path_factory.mktemp("workspace")
+    shutil.copytree(SAMPLE, workspace / "footage", ignore=shutil.ignore_patterns("project.json", "results"))
+    with serving(workspace, free_port()) as address:
+        yield workspace, address
+
+
+@pytest.fixture
+def project(server, request):
+    """The sample as a project of its own for each test: its folder and its pages' address."""
+    workspace, address = server
+    name = re.sub(r"[^a-z0-9]+", "-", request.node.name)[-40:].strip("-")
+    folder = workspace / name
+    folder.mkdir()
+    document = json.loads((SAMPLE / "project.json").read_text())
+    files = {"video": "video.mp4", "cloud": "site.laz", "lens": "lens.yaml"}
+    document["inputs"] = {kind: f"../footage/{file}" for kind, file in files.items()} | {"gps": None}
+    (folder / "project.json").write_text(json.dumps(document))
+    return folder, f"{address}/p/{name}"
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return read_project(SAMPLE)
+
+
+def saved(page: Page) -> None:
+    expect(page.locator(".save-state")).to_have_attribute("data-state", "saved")
+
+
+def pane(page: Page, name: str):
+    return page.get_by_role("application", name=re.compile(f"^{name}"))
+
+
+def ready(page: Page, name: str) -> None:
+    """Wait until a pane shows its picture."""
+    expect(pane(page, name)).to_have_attribute("data-picture", re.compile(r"\d+x\d+"), timeout=20_000)
+
+
+def pixels(page: Page) -> np.ndarray:
+    """Return what the window shows without marks and captions, grey, device px."""
+    page.evaluate("document.querySelectorAll('.pane > *:not(canvas)').forEach(e => e.style.visibility = 'hidden')")
+    picture = Image.open(BytesIO(page.screenshot())).convert("L")
+    page.evaluate("document.querySelectorAll('.pane > *').forEach(e => e.style.visibility = '')")
+    return np.asarray(picture, dtype=np.float32)
+
+
+def test_a_new_project_from_files_gets_its_orthoimage_and_twenty_pairs_by_real_clicks(browser, server, truth):
+    workspace, address = server
+    with watched(browser, address) as page:
+        page.goto(address)
+        page.get_by_role("button", name="New project").first.click()
+        page.get_by_label("Name", exact=True).fill("by-hand")
+        for kind, file in (("video", "video.mp4"), ("cloud", "site.laz"), ("lens", "lens.yaml")):
+            page.locator(f".file-row[data-kind={kind}]").get_by_role("button").click()
+            files = page.get_by_role("listbox", name="Files")
+            if files.get_by_role("option", name="footage").count() or kind == "video":
+                files.get_by_role("option", name="footage").click()
+            files.get_by_role("option", name=file).dblclick()
+        page.get_by_role("button", name="Create").click()
+        page.wait_for_url("**/p/by-hand/inputs")
+        for kind in ("video", "cloud", "lens"):
+            badge = page.locator(f".input-card[data-kind={kind}] .badge")
+            expect(badge).to_have_text("understood", timeout=60_000)  # a cloud is read in a job
+        expect(page.locator(".input-card[data-kind=video]")).to_contain_text("{} × {} px".format(*FRAME_SIZE))
+
+        page.goto(f"{address}/p/by-hand/orthoimage?view=picture")
+        page.get_by_label("Pixel on the ground").fill("2.5")
+        page.keyboard.press("Enter")
+        page.get_by_role("button", name="Make the orthoimage").click()
+        expect(page.locator("#raster-state")).to_have_text("made", timeout=60_000)
+
+        page.goto(f"{address}/p/by-hand/correspondences")
+        ready(page, "Reference frame"), ready(page, "Orthoimage")
+        grid = ask(f"{address}/p/by-hand", "orthoimage")["grid"]
+        size = (grid["width"], grid["height"])
+        for placed, pair in enumerate(truth.correspondences):
+            click_at(page, pane(page, "Reference frame"), FRAME_SIZE, np.array(pair.frame_px))
+            if placed == 4:
+                ghost = page.locator("[data-id='ghost-5']")
+                expect(ghost).to_have_count(1)
+                page.reload()  # neither the half nor its ghost is lost, and neither counts
+                ready(page, "Reference frame"), ready(page, "Orthoimage")
+                expect(ghost).to_have_count(1)
+                assert len(read_project(workspace / "by-hand").correspondences) == 4
+            click_at(page, pane(page, "Orthoimage"), size, ortho_px(grid, pair.ground_m))
+            expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(placed + 1)
+        expect(page.locator("#fit")).to_contain_text("RMS")
+        saved(page)
+
+    made = read_project(workspace / "by-hand").correspondences
+    clicks = np.array([pair.frame_px for pair in made]) - [pair.frame_px for pair in truth.correspondences]
+    ground = np.array([pair.ground_m for pair in made]) - [pair.ground_m for pair in truth.correspondences]
+    assert np.abs(clicks).max() < CLICK_PX
+    assert np.abs(ground).max() < CLICK_PX * grid["pixel_size_m"] * 2
+
+
+def ortho_px(grid, ground_m):
+    g = grid["pixel_size_m"]
+    return np.array([(ground_m[0] - grid["west_m"]) / g - 0.5, (grid["north_m"] - ground_m[1]) / g - 0.5])
+
+
+@pytest.mark.parametrize("ratio", [1, 2])
+def test_pixels_and_marks_lie_where_the_engine_says(browser, project, truth, ratio):
+    folder, pages = project
+    frame = cv2.cvtColor(cv2.imdecode(np.frombuffer(ask_bytes(pages, "frames/0.jpg"), np.uint8), 1), cv2.COLOR_BGR2GRAY)
+    with watched(browser, pages, device_scale_factor=ratio) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        element = pane(page, "Reference frame")
+        place = np.array(truth.correspondences[4].frame_px)
+        for wheel in (0.0, 1300.0):
+            lies = zoomed(page, element, FRAME_SIZE, place, wheel) if wheel else fitted(page, element, FRAME_SIZE)
+            page.wait_for_timeout(100)
+            for pair in truth.correspondences:
+                expected = lies.window(np.array(pair.frame_px))
+                assert centre_of(page.locator(f"[data-id='pair-{pair.id}']")) == pytest.approx(expected, abs=0.05)
+        box = element.bounding_box()
+        left, top, width, height = (round(box[name] * ratio) for name in ("x", "y", "width", "height"))
+        seen = pixels(page)[top : top + height, left : left + width]
+        # Near by, the pane shows true pixels. warpAffine counts pixel centres, the window edges: half a pixel apart.
+        per_px = lies.scale * ratio
+        shift = per_px * 0.5 + lies.corner * ratio - [left, top] - 0.5
+        matrix = np.array([[per_px, 0.0, shift[0]], [0.0, per_px, shift[1]]])
+        expected = cv2.warpAffine(frame, matrix, (width, height), flags=cv2.INTER_NEAREST).astype(np.float32)
+        moved, response = cv2.phaseCorrelate(expected, seen, cv2.createHanningWindow((width, height), cv2.CV_32F))
+        assert response > 0.9
+        assert np.hypot(*moved) / ratio < WITHIN_PX
+        assert (
+            page.evaluate("[...document.querySelectorAll('.pane > canvas')].map(c => c.width)")
+            == [round(box["width"] * ratio)] * 2
+        )
+
+
+def ask_bytes(pages: str, path: str) -> bytes:
+    with urllib.request.urlopen(f"{pages.replace('/p/', '/api/projects/')}/{path}") as answer:
+        return answer.read()
+
+
+def test_an_edit_is_undone_after_a_reload(browser, project):
+    folder, pages = project
+    before = read_project(folder)
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences?pair=3")
+        ready(page, "Reference frame")
+        pane(page, "Reference frame").focus()
+        for key in ("ArrowRight", "Shift+ArrowRight", "Alt+ArrowDown"):
+            page.keyboard.press(key)
+        saved(page)
+        u, v = before.correspondences[2].frame_px
+        assert read_project(folder).correspondences[2].frame_px == pytest.approx((u + 1.1, v + 0.02))
+        page.keyboard.press("Delete")
+        expect(page.locator("#pairs tbody tr[data-id='3']")).to_have_count(0)
+        saved(page)
+        page.reload()
+        ready(page, "Reference frame")
+        page.keyboard.press("Control+z")
+        expect(page.locator("#pairs tbody tr[data-id='3']")).to_have_count(1)
+        page.get_by_role("button", name="Undo: Nudge pair 3").click()
+        expect(page.get_by_role("button", name="Redo: Nudge pair 3")).to_be_enabled()
+    assert read_project(folder) == before
+
+
+def test_a_second_tab_on_an_older_state_is_told_not_obeyed(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as first, watched(browser, pages) as second:
+        second.route("**/events", lambda route: route.abort())  # it does not hear of the other's edits
+        first.goto(f"{pages}/correspondences"), second.goto(f"{pages}/correspondences")
+        ready(second, "Reference frame")
+        first.get_by_role("checkbox", name="Pair 2 counts").click()
+        saved(first)
+        second.get_by_role("checkbox", name="Pair 5 counts").click()
+        expect(second.get_by_role("alert")).to_contain_text("another window has changed this project")
+        assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [2]
+        expect(second.get_by_role("checkbox", name="Pair 2 counts")).not_to_be_checked()
+        expect(second.get_by_role("checkbox", name="Pair 5 counts")).to_be_checked()
+        second.get_by_role("button", name="Do it again").click()
+        expect(first.get_by_role("checkbox", name="Pair 5 counts")).not_to_be_checked()
+    assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [2, 5]
+
+
+def test_clicks_on_the_undistorted_frame_are_stored_raw(browser, project):
+    folder, pages = project
+    lens = read_lens(SAMPLE / "lens.yaml")
+    wanted = np.array(FRAME_SIZE) * [0.15, 0.85]
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        page.keyboard.press("u")
+        expect(page.locator(".pane-chip", has_text="undistorted")).to_be_visible()
+        mark = page.locator("[data-id='pair-1']").first
+        lies = zoomed(page, pane(page, "Reference frame"), FRAME_SIZE, wanted)
+        raw = np.array(read_project(folder).correspondences[0].frame_px)
+        assert centre_of(mark) == pytest.approx(lies.window(lens.undistort(raw)), abs=WITHIN_PX)
+        page.mouse.click(*np.round(lies.window(wanted)))
+        expect(page.get_by_label("u", exact=True)).not_to_have_value("")
+        stored = [float(page.get_by_label(name, exact=True).input_value()) for name in ("u", "v")]
+    assert np.array(stored) == pytest.approx(lens.distort(wanted), abs=CLICK_PX)
+
+
+def test_points_go_to_qgis_and_come_back(browser, project, tmp_path):
+    folder, pages = project
+    before = read_project(folder).correspondences
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        page.get_by_role("button", name="Import and export").click()
+        with page.expect_download() as download:
+            page.get_by_role("menuitem", name="Export").click()
+        file = tmp_path / "clicks.points"
+        download.value.save_as(file)
+        first = file.read_text().splitlines()[1].split(",")
+        u, v = before[0].frame_px
+        assert [float(cell) for cell in first[:5]] == pytest.approx([*before[0].ground_m, u + 0.5, -(v + 0.5), 1])
+        page.get_by_role("button", name="Import and export").click()
+        with page.expect_file_chooser() as chooser:
+            page.get_by_role("menuitem", name="Import").click()
+        chooser.value.set_files(file)
+        expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(40)
+        saved(page)
+    after = read_project(folder).correspondences
+    assert np.array([pair.frame_px for pair in after[20:]]) == pytest.approx(
+        np.array([pair.frame_px for pair in before])
+    )
+
+
+def test_regions_and_bands_are_drawn_and_previewed_as_the_engine_sees_them(browser, project, truth):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    target, regions = document["targets"][0], document["moving_regions_px"]
+    (folder / "project.json").write_text(json.dumps(document | {"targets": [], "moving_regions_px": []}))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions")
+        ready(page, "Reference frame"), ready(page, "Orthorectified")
+        frame, plan = pane(page, "Reference frame"), pane(page, "Orthorectified")
+        for corner in (regions[0][i] for i in (0, 1, 3, 4)):
+            page.mouse.click(*np.round(fitted(page, frame, FRAME_SIZE).window(np.array(corner))))
+            page.wait_for_timeout(400)  # two clicks within a third of a second are a double click
+        page.keyboard.press("Enter")
+        expect(page.locator("#moving .badge")).to_have_text("4 corners")
+        grid = ask(pages, "rectified")["grid"]
+        size = (grid["width"], grid["height"])
+        for line in ("L1", "L2", "T1"):
+            band = target["lines"][line]
+            ends = np.array([band["from_m"], band["to_m"]])
+            along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
+            beside = ends.mean(axis=0) + np.array([-along[1], along[0]]) * band["width_m"] / 2
+            for place in (*ends, beside):
+                click_at(page, plan, size, ortho_px(grid, place))
+        expect(page.locator("#targets li[data-target=roof]")).to_be_visible()
+        expect(page.locator(".band-row[data-line=L1] .found")).to_contain_text("points")
+        page.get_by_label("Height above ground").fill(str(target["height_m"]))
+        page.get_by_label("P1–P2 distance").fill("1.22")
+        page.keyboard.press("Enter")
+        saved(page)
+        made = read_project(folder).targets[0]
+        for line in ("L1", "L2", "T1"):
+            drawn, given = getattr(made.lines, line), target["lines"][line]
+            assert [*drawn.from_m, *drawn.to_m] == pytest.approx([*given["from_m"], *given["to_m"]], abs=0.01)
+            assert drawn.width_m == pytest.approx(given["width_m"], abs=0.02)
+
+        seen = preview(page, pages, made)
+        for name in ("p1", "p2"):
+            raw = fitted(page, frame, FRAME_SIZE).window(np.array(seen[name]["raw"]))
+            mark = page.locator(f"#frame [data-id='found:{name}']")
+            expect(mark).to_have_count(1)
+            assert centre_of(mark) == pytest.approx(raw, abs=WITHIN_PX)
+            flat = fitted(page, plan, size).window(ortho_px(grid, seen[name]["plan"]))
+            assert centre_of(page.locator(f"#plan [data-id='found:{name}']")) == pytest.approx(flat, abs=WITHIN_PX)
+
+        drag_band(page, plan, size, grid, made.lines.L1)
+        saved(page)
+        moved = read_project(folder).targets[0].lines.L1
+        assert np.array(moved.from_m) - made.lines.L1.from_m == pytest.approx([0.0, 0.5], abs=0.03)
+        page.keyboard.press("Shift+ArrowUp")
+        page.keyboard.press("]")
+        saved(page)
+        nudged = read_project(folder).targets[0].lines.L1
+        assert nudged.from_m[1] - moved.from_m[1] == pytest.approx(grid["pixel_size_m"], abs=2e-4)
+        assert nudged.width_m - moved.width_m == pytest.approx(0.02)
+
+
+def preview(page: Page, pages: str, target) -> dict:
+    address = pages.replace("/p/", "/api/projects/")
+    headers = {"X-Rooftrack": "1", "Origin": pages.split("/p/")[0]}
+    body = {"target": target.model_dump(mode="json")}
+    return page.request.post(f"{address}/lines/preview", data=body, headers=headers).json()
+
+
+def drag_band(page: Page, plan, size, grid, band) -> None:
+    """Drag a band half a metre to the north by its inside."""
+    middle = np.array(band.from_m) * 0.8 + np.array(band.to_m) * 0.2
+    lies = zoomed(page, plan, size, ortho_px(grid, middle), 900.0)
+    page.mouse.move(*lies.window(ortho_px(grid, middle)))
+    page.mouse.down()
+    page.mouse.move(*lies.window(ortho_px(grid, middle + [0.0, 0.25])))
+    page.mouse.move(*lies.window(ortho_px(grid, middle + [0.0, 0.5])))
+    page.mouse.up()
+
+
+def test_a_pair_is_placed_by_the_keyboard_alone(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        pane(page, "Reference frame").focus()
+        page.keyboard.press("Escape")
+        page.keyboard.press("1")
+        page.keyboard.press("ArrowRight")
+        page.keyboard.press("Enter")
+        expect(page.locator("#selection")).to_contain_text("Pair 21, unfinished")
+        for name, value in (("east", "1.5"), ("north", "-2.25")):
+            page.get_by_label(name, exact=True).fill(value)
+            page.keyboard.press("Enter")
+        expect(page.locator("#pairs tbody tr[data-id='21']")).to_have_count(1)
+        page.keyboard.press("Escape")
+        page.locator("body").press("?")
+        expect(page.get_by_role("dialog")).to_contain_text("Nudge the selected mark by 0.02 px")
+        saved(page)
+    assert read_project(folder).correspondences[20].ground_m == (1.5, -2.25)
+
+
+def test_inputs_are_sent_taken_back_and_calibrated(browser, project, server, tmp_path):
+    folder, pages = project
+    workspace, _ = server
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/inputs")
+        lens = page.locator(".input-card[data-kind=lens]")
+        expect(lens.locator(".badge")).to_have_text("understood")
+        lens.get_by_role("button", name="Remove").click()
+        expect(lens.locator(".badge")).to_have_text("not given")
+        with page.expect_file_chooser() as chooser:
+            lens.get_by_role("button", name="Upload…").click()
+        chooser.value.set_files(SAMPLE / "lens.yaml")
+        expect(lens.locator(".badge")).to_have_text("understood")
+        assert read_project(folder).inputs.lens == "lens.yaml"
+        with page.expect_file_chooser() as chooser:
+            lens.get_by_role("button", name="Upload…").click()
+        wrong = tmp_path / "wrong.yaml"
+        wrong.write_text("not a lens")
+        chooser.value.set_files(wrong)
+        expect(lens.locator(".note.bad")).to_contain_text("wrong.yaml")
+
+        lens.get_by_role("button", name="Calibrate…").click()
+        page.get_by_role("button", name="Pictures on this computer…").click()
+        files = page.get_by_role("listbox", name="Files")
+        files.get_by_role("option", name="footage").click()
+        files.get_by_role("option", name="checkerboards").click()
+        for board in files.get_by_role("option").all():
+            board.click()
+        page.get_by_role("button", name=re.compile(r"Choose \d+ files")).click()
+        page.get_by_label("Square").fill("0.04")
+        page.get_by_role("button", name="Calibrate", exact=True).click()
+        report = page.get_by_role("region", name="Calibration report")
+        expect(report).to_contain_text("pictures used", timeout=60_000)
+        expect(lens.locator(".badge")).to_have_text("understood")
+    assert read_lens(folder / read_project(folder).inputs.lens).focal_px[0] == pytest.approx(
+        read_lens(SAMPLE / "lens.yaml").focal_px[0], rel=0.02
+    )
+
+
+def test_projects_are_copied_renamed_archived_restored_and_deleted_with_undo(browser, project, tmp_path):
+    folder, pages = project
+    address = pages.split("/p/")[0]
+    with watched(browser, address) as page:
+        page.goto(address)
+        card = page.locator(f"[data-project='{folder.name}']")
+        act(page, card, "Rename…", name="Sample by hand")
+        expect(card.get_by_role("heading")).to_have_text("Sample by hand")
+        act(page, card, "Duplicate…", name="A copy of it")
+        expect(page.get_by_role("heading", name="A copy of it")).to_be_visible()
+        with page.expect_download() as download:
+            act(page, card, "Archive without inputs")
+        archive = tmp_path / "sample.zip"
+        download.value.save_as(archive)
+        act(page, card, "Delete")
+        expect(card).to_have_count(0)
+        assert not folder.exists()
+        page.get_by_role("button", name="Undo", exact=True).click()
+        expect(card).to_have_count(1)
+        before = page.locator("[data-project]").count()
+        with page.expect_file_chooser() as chooser:
+            page.get_by_role("button", name="Restore archive…").click()
+        chooser.value.set_files(archive)
+        expect(page.locator("[data-project]")).to_have_count(before + 1)
+    assert read_project(folder).name == "Sample by hand"
+
+
+def act(page: Page, card, item: str, name: str | None = None) -> None:
+    """Choose an action of a project's menu, and answer with a name where it asks for one."""
+    card.get_by_role("button", name="Actions for").click()
+    page.get_by_role("menuitem", name=item).click()
+    if name is not None:
+        page.get_by_role("dialog").get_by_role("textbox").fill(name)
+        page.keyboard.press("Enter")
