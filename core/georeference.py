@@ -234,7 +234,9 @@ def _fit(rays: Floats, points: Floats, has_lens: bool) -> _Model:
     if not has_lens:
         return _Model(H_plan_ray, None)
     pose = _pose(rays, points, pose_from_homography(invert_homography(H_plan_ray)))
-    if not np.isfinite(pose.centre_m).all() or pose.centre_m[2] <= 0:
+    # A mirrored ground is fitted just as well, by a camera that has it behind itself.
+    in_front = ((points - pose.centre_m) @ pose.R[2] > 0).all()
+    if not np.isfinite(pose.centre_m).all() or pose.centre_m[2] <= 0 or not in_front:
         raise InputError(
             "project.json: no camera above the ground sees the correspondences like this; look for swapped or mirrored "
             "pairs, east and north exchanged, or a lens.yaml of another camera."
