@@ -1,0 +1,233 @@
+from __future__ import annotations
+
+import threading
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from core.errors import InputError
+from core.video import Luma, frame_index, probe, read_frame, read_frame_rgb, read_frames, read_frames_rgb
+
+SIZE = (96, 64)
+FRAMES = 50
+
+
+def picture(number: int, size: tuple[int, int] = SIZE) -> Luma:
+    """A frame that shows its own number in twelve blocks, brightest in the top left corner."""
+    width, height = size
+    luma = np.full((height, width), 60, dtype=np.uint8)
+    luma[: height // 4, : width // 4] = 235
+    for bit in range(8):
+        luma[height // 2 :, bit * width // 8 : (bit + 1) * width // 8] = 200 if number >> bit & 1 else 20
+    return luma
+
+
+def number_of(luma: Luma) -> int:
+    height, width = luma.shape
+    middles = [luma[3 * height // 4, (2 * bit + 1) * width // 16] > 110 for bit in range(8)]
+    return sum(1 << bit for bit, on in enumerate(middles) if on)
+
+
+def write(
+    file: Path,
+    *,
+    frames: int = FRAMES,
+    size: tuple[int, int] = SIZE,
+    codec: str = "libx264",
+    pix_fmt: str = "yuv420p",
+    ticks: list[int] | None = None,
+    rotation: int = 0,
+    options: dict[str, str] | None = None,
+) -> Path:
+    """Write a video with B-frames and a key frame every twelve frames; ticks are thousandths of a second."""
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream(codec, rate=25, options={"bf": "3", "g": "12", **(options or {})})
+        stream.width, stream.height = size
+        stream.pix_fmt = pix_fmt
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        for number in range(frames):
+            frame = av.VideoFrame.from_ndarray(picture(number, size), format="gray").reformat(format=pix_fmt)
+            frame.pts = ticks[number] if ticks else 40 * number
+            frame.time_base = Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    if rotation:
+        _turned(file, rotation)
+    return file
+
+
+def _turned(file: Path, rotation: int) -> None:
+    """Set the display matrix of an MP4 file: the turn, clockwise, that a player must make."""
+    cosine, sine = {90: (0, 1), 180: (-1, 0), 270: (0, -1)}[rotation]
+    one = 1 << 16
+    unturned = b"".join(value.to_bytes(4, "big", signed=True) for value in (one, 0, 0, 0, one, 0, 0, 0, 1 << 30))
+    turned = (cosine * one, sine * one, 0, -sine * one, cosine * one, 0, 0, 0, 1 << 30)
+    content = file.read_bytes()
+    place = content.index(b"tkhd")
+    at = content.index(unturned, place)
+    matrix = b"".join(value.to_bytes(4, "big", signed=True) for value in turned)
+    file.write_bytes(content[:at] + matrix + content[at + len(matrix) :])
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("video") / "video.mp4")
+
+
+# --- every frame, once, in order -------------------------------------------------------------------------------------
+
+
+def test_what_the_container_says(video: Path) -> None:
+    info = probe(video)
+    assert (info.width, info.height, info.frames, info.rotation_deg) == (96, 64, FRAMES, 0)
+    assert info.codec == "h264"
+    assert info.rate_hz == pytest.approx(25.0)
+    assert info.duration_s == pytest.approx(2.0, abs=0.05)
+
+
+def test_index_without_decoding_is_that_of_decoding(video: Path) -> None:
+    index = frame_index(video)
+    frames = list(read_frames(video))
+    assert len(index) == len(frames) == FRAMES
+    np.testing.assert_allclose(index.time_s, [frame.time_s for frame in frames], atol=1e-9)
+    np.testing.assert_allclose(index.time_s, np.arange(FRAMES) / 25, atol=1e-9)
+    assert len(index.key_ticks) >= 4
+
+
+def test_frames_come_in_presentation_order(video: Path) -> None:
+    frames = list(read_frames(video))
+    assert [frame.index for frame in frames] == list(range(FRAMES))
+    assert [number_of(frame.luma) for frame in frames] == list(range(FRAMES))
+    assert frames[0].luma.shape == (64, 96)
+    assert frames[0].luma.dtype == np.uint8
+
+
+@pytest.mark.parametrize("start", [1, 11, 12, 13, 37, FRAMES - 1])
+def test_a_part_is_the_same_as_in_the_whole(video: Path, start: int) -> None:
+    whole = list(read_frames(video))[start : start + 5]
+    part = list(read_frames(video, start, start + 5, threads=1))
+    assert [frame.index for frame in part] == [frame.index for frame in whole]
+    assert [frame.time_s for frame in part] == [frame.time_s for frame in whole]
+    for one, other in zip(part, whole, strict=True):
+        np.testing.assert_array_equal(one.luma, other.luma)
+
+
+def test_single_frames(video: Path) -> None:
+    for number in (0, 25, 49):
+        assert number_of(read_frame(video, number).luma) == number
+        rgb = read_frame_rgb(video, number)
+        assert rgb.shape == (64, 96, 3)
+        assert number_of(rgb[..., 1]) == number
+    assert [index for index, _ in read_frames_rgb(video, 20, 24)] == [20, 21, 22, 23]
+
+
+def test_uneven_timestamps_are_the_containers_own(tmp_path: Path) -> None:
+    ticks = np.cumsum(np.random.default_rng(0).integers(25, 90, 30)) + 700
+    file = write(tmp_path / "uneven.mp4", frames=30, ticks=ticks.tolist())
+    expected = (ticks - ticks[0]) / 1000
+    np.testing.assert_allclose([frame.time_s for frame in read_frames(file)], expected, atol=1e-4)
+    np.testing.assert_allclose(frame_index(file).time_s, expected, atol=1e-4)
+    assert [number_of(frame.luma) for frame in read_frames(file, 17, 20)] == [17, 18, 19]
+
+
+# --- upright ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("rotation", "corner"), [(90, (0, -1)), (180, (-1, -1)), (270, (-1, 0))])
+def test_turned_frames_are_made_upright(tmp_path: Path, rotation: int, corner: tuple[int, int]) -> None:
+    file = write(tmp_path / "turned.mp4", frames=3, rotation=rotation)
+    info = probe(file)
+    assert info.rotation_deg == rotation
+    assert (info.width, info.height) == ((96, 64) if rotation == 180 else (64, 96))
+    luma, rgb = read_frame(file, 1).luma, read_frame_rgb(file, 1)
+    assert luma.shape == rgb.shape[:2] == (info.height, info.width)
+    # The bright corner was at the top left; it turns clockwise with the picture.
+    assert luma[corner] > 200
+    assert rgb[(*corner, 1)] > 200
+
+
+# --- other pictures --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("codec", "pix_fmt", "name"),
+    [
+        ("libx264", "yuv444p", "v.mp4"),
+        ("mpeg4", "yuv420p", "v.avi"),
+        ("ffv1", "gray", "v.mkv"),
+        ("ffv1", "yuv420p10le", "v.mkv"),
+    ],
+)
+def test_other_pixels_than_eight_bit_420(tmp_path: Path, codec: str, pix_fmt: str, name: str) -> None:
+    options = {"bf": "0"} if codec != "libx264" else {}
+    file = write(tmp_path / name, frames=6, codec=codec, pix_fmt=pix_fmt, options=options)
+    assert [number_of(frame.luma) for frame in read_frames(file)] == list(range(6))
+    assert all(frame.luma.dtype == np.uint8 for frame in read_frames(file))
+
+
+def test_odd_sizes_have_no_padding(tmp_path: Path) -> None:
+    file = write(tmp_path / "odd.mkv", frames=2, size=(98, 66), codec="ffv1")
+    luma = read_frame(file, 1).luma
+    assert luma.shape == (66, 98)
+    np.testing.assert_allclose(luma.astype(int), picture(1, (98, 66)), atol=25)  # full against studio range
+
+
+# --- bad videos ------------------------------------------------------------------------------------------------------
+
+
+def test_no_such_file(tmp_path: Path) -> None:
+    for read in (probe, frame_index, lambda file: read_frame(file, 0)):
+        with pytest.raises(InputError, match=r"gone\.mp4: not found; correct inputs\.video"):
+            read(tmp_path / "gone.mp4")
+
+
+def test_no_video_at_all(tmp_path: Path) -> None:
+    file = tmp_path / "text.mp4"
+    file.write_text("not a video" * 100)
+    with pytest.raises(InputError, match=r"text\.mp4: cannot be opened as a video"):
+        probe(file)
+    file.write_bytes(b"")
+    with pytest.raises(InputError, match=r"text\.mp4"):
+        probe(file)
+
+
+def test_sound_alone(tmp_path: Path) -> None:
+    file = tmp_path / "sound.wav"
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), dtype=np.int16), format="s16", layout="mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with pytest.raises(InputError, match="holds no video stream"):
+        probe(file)
+
+
+def test_frames_beyond_the_end(video: Path) -> None:
+    with pytest.raises(InputError, match="has 50 frames, so there is no frame 50"):
+        list(read_frames(video, FRAMES))
+    with pytest.raises(InputError, match="there is no frame 70"):
+        read_frame(video, 70)
+    with pytest.raises(InputError, match="there is no frame 70"):
+        read_frame_rgb(video, 70)
+
+
+def test_a_file_cut_off_gives_what_came_before(tmp_path: Path) -> None:
+    whole = write(tmp_path / "whole.ts", frames=FRAMES)
+    cut = tmp_path / "cut.ts"
+    content = whole.read_bytes()
+    cut.write_bytes(content[: len(content) * 2 // 3])
+    frames = list(read_frames(cut))
+    assert 10 < len(frames) < FRAMES
+    assert [number_of(frame.luma) for frame in frames[:10]] == list(range(10))
+
+
+def test_who_stops_reading_leaves_no_thread_behind(video: Path) -> None:
+    reading = read_frames(video)
+    assert next(reading).index == 0
+    assert any(thread.name == "video decoder" for thread in threading.enumerate())
+    reading.close()
+    assert not any(thread.name == "video decoder" for thread in threading.enumerate())
