@@ -28,6 +28,7 @@ import { selectionPanel } from "./correspondences/selection-panel.js";
 /** @typedef {import("./correspondences/slots.js").Side} Side */
 
 const REFINE_SCALE = 4; // CSS px per image px when zooming to a pair
+const COMPARED_PIXELS = 4_000_000; // enough to compare by eye, and quick to make after each edit
 const NO_FIT = /** @type {Fit} */ ({ state: "too_few", message: "", rms_px: null, rms_m: null, loo_rms_px: null, pairs: [], coverage: null, camera: null });
 
 const page = await openPage("correspondences");
@@ -240,7 +241,7 @@ const arrowToggle = toggleButton("Residuals", "Arrows from each mark to where th
   showFit();
 });
 const loupeToggle = toggleButton("Loupe", "True pixels around the pointer (Z)", true, (on) => sides.forEach((side) => side.loupe.setEnabled(on)));
-const compare = compareControls(ortho.pane, { load: () => loadImage(projectPath(page.id, "rectified.jpg", { v: store.revision }), ortho) });
+const compare = compareControls(ortho.pane, { load: () => loadImage(projectPath(page.id, "rectified.jpg", { v: store.revision, pixels: COMPARED_PIXELS }), ortho) });
 const referenceFrame = numberField({
   label: "Reference frame",
   unit: "",

@@ -3,28 +3,19 @@
 import { post, projectPath } from "../../lib/api.js";
 import { fill, h } from "../../lib/dom.js";
 import { count, plural } from "../../lib/format.js";
+import { pointsShown } from "../../lib/graphics.js";
 import { latest } from "../../lib/latest.js";
 import { segmented } from "../../components/segmented.js";
 import { toastError } from "../../components/toast.js";
 
 /** @typedef {"cloud" | "ground" | "orthoimage" | "camera" | "lines"} Part */
 
-const FEW = 100_000;
-const MANY = 1_000_000;
-const ALL = 5_000_000;
+const CHOICES = [{ value: "100000", name: "100 k" }, { value: "1000000", name: "1 M" }, { value: "5000000", name: "5 M" }];
 const PARTS = /** @type {const} */ ([["cloud", "Cloud"], ["ground", "Ground plane"], ["orthoimage", "Orthoimage"], ["camera", "Camera"], ["lines", "Lines"]]);
-
-/** Whether this browser draws 3D without a graphics card. */
-function drawsInSoftware() {
-  const context = document.createElement("canvas").getContext("webgl");
-  const names = context?.getExtension("WEBGL_debug_renderer_info");
-  const renderer = names ? String(context?.getParameter(names.UNMASKED_RENDERER_WEBGL)) : "";
-  return context === null || /swiftshader|llvmpipe|software|basic render/i.test(renderer);
-}
 
 /** @param {HTMLElement} element @param {string} projectId @param {(message: string) => void} onMessage */
 export function scenePanel(element, projectId, onMessage) {
-  const wish = { colour: "rgb", points: drawsInSoftware() ? FEW : MANY, show: /** @type {Record<Part, boolean>} */ ({ cloud: true, ground: true, orthoimage: false, camera: true, lines: true }) };
+  const wish = { colour: "rgb", points: pointsShown(), show: /** @type {Record<Part, boolean>} */ ({ cloud: true, ground: true, orthoimage: false, camera: true, lines: true }) };
   const shown = h("p", { class: "small faint number", role: "status" });
   const ask = latest(
     (/** @type {typeof wish} */ wanted) => post(projectPath(projectId, "scene"), wanted),
@@ -43,7 +34,7 @@ export function scenePanel(element, projectId, onMessage) {
   });
   const points = segmented({
     label: "Points drawn",
-    choices: [{ value: String(FEW), name: "100 k" }, { value: String(MANY), name: "1 M" }, { value: String(ALL), name: "5 M" }],
+    choices: CHOICES,
     value: String(wish.points),
     onChange: (value) => ((wish.points = Number(value)), send()),
   });
