@@ -139,7 +139,7 @@ def ortho_px(grid, ground_m):
 
 @pytest.mark.parametrize("ratio", [1, 2])
 def test_pixels_and_marks_lie_where_the_engine_says(browser, project, truth, ratio):
-    folder, pages = project
+    _, pages = project
     frame = cv2.cvtColor(cv2.imdecode(np.frombuffer(ask_bytes(pages, "frames/0.jpg"), np.uint8), 1), cv2.COLOR_BGR2GRAY)
     with watched(browser, pages, device_scale_factor=ratio) as page:
         page.goto(f"{pages}/correspondences")
@@ -357,9 +357,8 @@ def test_a_pair_is_placed_by_the_keyboard_alone(browser, project):
     assert read_project(folder).correspondences[20].ground_m == (1.5, -2.25)
 
 
-def test_inputs_are_sent_taken_back_and_calibrated(browser, project, server, tmp_path):
+def test_inputs_are_sent_taken_back_and_calibrated(browser, project, tmp_path):
     folder, pages = project
-    workspace, _ = server
     with watched(browser, pages) as page:
         page.goto(f"{pages}/inputs")
         lens = page.locator(".input-card[data-kind=lens]")
