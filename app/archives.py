@@ -6,6 +6,7 @@ import io
 import os
 import shutil
 import stat
+import time
 import zipfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
@@ -155,8 +156,14 @@ def _trusted_entries(archive: zipfile.ZipFile, archive_file: Path) -> dict[zipfi
     inner = {entry: place.relative_to(top) if top else place for entry, place in places.items()}
     if PurePosixPath(PROJECT_FILE) not in inner.values():
         raise Invalid(f"The archive holds no {PROJECT_FILE}; choose one made by Rooftrack.")
+    return {entry: place for entry, place in inner.items() if not _is_servers_own(place)}
+
+
+def _is_servers_own(place: PurePosixPath) -> bool:
+    """Whether a file is what a server notes down for itself; one from elsewhere would be believed."""
     own = (PurePosixPath(HISTORY_FILE), PurePosixPath(RESULTS_FOLDER, JOB_FILE))
-    return {entry: place for entry, place in inner.items() if place not in own}
+    cached = PurePosixPath(RESULTS_FOLDER, CACHE_FOLDER) in place.parents
+    return place in own or cached or any(part.startswith(".") for part in place.parts)
 
 
 def _safe_place(entry: zipfile.ZipInfo) -> PurePosixPath:
@@ -185,5 +192,8 @@ def _unpack(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> N
                 if left < 0:
                     raise Invalid(f"The archive lies about the size of {entry.filename!r}; it was not unpacked.")
                 stream.write(piece)
+        # By their times it is told whether results are older than inputs.
+        packed_s = time.mktime((*entry.date_time, 0, 0, -1))
+        os.utime(target, (packed_s, packed_s))
     except FileExistsError:
         raise Invalid(f"The archive holds {entry.filename!r} twice; choose one made by Rooftrack.") from None

@@ -1,0 +1,202 @@
+"""Inputs: sent in pieces or not at all, understood, refused in sentences."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import uvicorn
+
+from app.context import Context
+from app.server import create_app
+from tests.app.conftest import ADDRESS, WRITE, TestClient
+
+SMALL = "/api/projects/small"
+
+
+def send(client: TestClient, kind: str, name: str, content: Any) -> Any:
+    return client.put(f"{SMALL}/upload/{kind}", params={"filename": name}, content=content)
+
+
+def test_a_file_that_is_sent_becomes_the_input(client: TestClient, workspace: Path) -> None:
+    lens = (workspace / "small" / "lens.yaml").read_bytes()
+    pieces = (lens[start : start + 7] for start in range(0, len(lens), 7))
+    answer = send(client, "lens", "my lens.yaml", pieces).json()
+    assert (workspace / "small" / "my lens.yaml").read_bytes() == lens
+    state = client.get(SMALL).json()
+    assert state["project"]["inputs"]["lens"] == "my lens.yaml"
+    assert (state["revision"], state["undo_label"]) == (answer["revision"], "take in lens my lens.yaml")
+
+
+def test_a_gps_record_keeps_the_names_of_its_columns(client: TestClient, workspace: Path) -> None:
+    send(client, "gps", "again.csv", (workspace / "small" / "gps.csv").read_bytes())
+    gps = client.get(SMALL).json()["project"]["inputs"]["gps"]
+    assert (gps["file"], gps["time"], gps["x"]) == ("again.csv", "time_s", "east_m")
+
+
+@pytest.mark.parametrize("name", ["../../evil.yaml", "a/b/evil.yaml", "..\\..\\evil.yaml", "C:\\evil.yaml"])
+def test_a_name_that_leads_elsewhere_stays_in_the_project(client: TestClient, workspace: Path, name: str) -> None:
+    assert send(client, "lens", name, b"x").json()["file"] == "evil.yaml"
+    assert (workspace / "small" / "evil.yaml").is_file()
+
+
+@pytest.mark.parametrize("name", ["project.json", "PROJECT.JSON", "history.sqlite", "results", "..", "", "/"])
+def test_a_name_the_project_itself_uses_is_refused(client: TestClient, workspace: Path, name: str) -> None:
+    before = sorted(path.name for path in (workspace / "small").iterdir())
+    answer = send(client, "lens", name, b"x")
+    assert (answer.status_code, answer.json()["error"]["path"]) == (422, "filename")
+    assert sorted(path.name for path in (workspace / "small").iterdir() if "sqlite" not in path.name) == [
+        name for name in before if "sqlite" not in name
+    ]
+
+
+def test_an_empty_file_is_refused(client: TestClient, workspace: Path) -> None:
+    assert send(client, "lens", "empty.yaml", b"").status_code == 422
+    assert not (workspace / "small" / "empty.yaml").exists()
+
+
+@pytest.fixture
+def address(workspace: Path) -> Iterator[tuple[str, int]]:
+    """A real server: what breaks off on the network cannot be shown in one process."""
+    config = uvicorn.Config(create_app(workspace), port=0, log_level="error", lifespan="on")
+    server = uvicorn.Server(config)
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
+        thread.start()
+        until(lambda: server.started)
+        yield listening.getsockname()
+        server.should_exit = True
+        thread.join()
+
+
+def until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 20
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_a_transfer_that_breaks_off_leaves_nothing(address: tuple[str, int], workspace: Path) -> None:
+    folder = workspace / "small"
+    with socket.create_connection(address) as line:
+        head = (
+            f"PUT {SMALL}/upload/video?filename=large.mp4 HTTP/1.1\r\nHost: 127.0.0.1:{address[1]}\r\n"
+            "X-Rooftrack: 1\r\nContent-Length: 90000000\r\n\r\n"
+        )
+        line.sendall(head.encode() + bytes(5_000_000))
+        until(lambda: any(folder.glob(".incoming-*")))
+        line.sendall(bytes(5_000_000))
+    until(lambda: not any(folder.glob(".incoming-*")))
+    assert not (folder / "large.mp4").exists()
+
+
+def test_what_a_killed_server_left_half_sent_is_removed(workspace: Path) -> None:
+    half = workspace / "small" / ".incoming-0123456789abcdef"
+    half.write_bytes(b"half")
+    with TestClient(create_app(workspace), base_url=ADDRESS, headers=WRITE):
+        assert not half.exists()
+
+
+def test_a_disk_without_room_is_told_before_anything_is_sent(
+    client: TestClient, workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from app import uploads
+
+    class Full:
+        free = 1000
+
+    monkeypatch.setattr(uploads.shutil, "disk_usage", lambda place: Full)
+    answer = send(client, "video", "large.mp4", b"x" * 100)
+    assert "make room" in answer.json()["error"]["message"]
+    assert not list((workspace / "small").glob(".incoming-*"))
+
+
+def test_every_input_is_understood(client: TestClient) -> None:
+    inputs = client.get(f"{SMALL}/inputs").json()
+    video, lens, gps = inputs["video"], inputs["lens"], inputs["gps"]
+    assert (video["width"], video["height"], video["frames"], video["codec"]) == (160, 120, 40, "h264")
+    assert video["rate_hz"] == pytest.approx(20.0)
+    assert not video["variable_rate"]
+    assert lens["focal_px"] == [150.0, 150.0]
+    assert (gps["rows"], gps["rate_hz"]) == (20, pytest.approx(10.0))
+
+
+def test_a_cloud_is_read_beside_the_server_and_known_from_then_on(
+    client: TestClient, context: Context, finished: Callable[[dict[str, Any]], dict[str, Any]]
+) -> None:
+    assert client.get(f"{SMALL}/inputs").json()["cloud"]["reading"]
+    job = context.jobs.latest("small", "cloud")
+    assert job is not None
+    assert finished(job.as_json())["state"] == "done"
+    cloud = client.get(f"{SMALL}/inputs").json()["cloud"]
+    assert cloud["points"] == 80 * 80
+    assert cloud["ground"]["spread_m"] == pytest.approx(0.01, abs=0.002)
+    height = client.get(f"{SMALL}/height", params={"x": 1.0, "y": 2.0}).json()
+    assert height["height_m"] == pytest.approx(0.0, abs=0.02)
+    assert client.get(f"{SMALL}/height", params={"x": 500.0, "y": 0.0}).status_code == 422
+    made = finished(client.post(f"{SMALL}/orthoimage").json()["job"])
+    assert made["state"] == "done", made["message"]
+    state = client.get(f"{SMALL}/orthoimage").json()
+    assert (state["ready"], state["stale"], state["job"]) == (True, False, None)
+    picture = client.get(f"{SMALL}/orthoimage.png", params={"w": 200})
+    pixels = cv2.imdecode(np.frombuffer(picture.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert (pixels.shape[1], pixels.shape[2]) == (200, 4)
+    project = client.get(SMALL).json()
+    project["project"]["orthoimage"]["pixel_size_m"] = 0.02
+    client.put(SMALL, json={"project": project["project"], "revision": project["revision"]})
+    assert client.get(f"{SMALL}/orthoimage").json()["stale"]
+
+
+def test_inputs_that_cannot_be_used_are_told_one_by_one(client: TestClient, workspace: Path) -> None:
+    (workspace / "small" / "video.mp4").write_bytes(b"no video")
+    (workspace / "small" / "lens.yaml").write_text("%YAML:1.0\nimage_width: 4\n")
+    (workspace / "small" / "gps.csv").unlink()
+    inputs = client.get(f"{SMALL}/inputs").json()
+    assert "cannot be opened as a video" in inputs["video"]["error"]["message"]
+    assert "lens.yaml" in inputs["lens"]["error"]["message"]
+    assert "not found" in inputs["gps"]["error"]["message"]
+
+
+def test_checkerboard_pictures_are_kept_listed_and_removed(client: TestClient) -> None:
+    picture = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
+    assert send(client, "checkerboard", "one.png", picture).json()["file"] == "checkerboard/one.png"
+    assert send(client, "checkerboard", "one.txt", picture).status_code == 422
+    assert [image["name"] for image in client.get(f"{SMALL}/lens/images").json()["images"]] == ["one.png"]
+    assert client.get(f"{SMALL}/lens/images/one.png").content == picture
+    for name in ("..%2Flens.yaml", "two.png", "..%2F..%2Fsmall%2Flens.yaml"):
+        assert client.get(f"{SMALL}/lens/images/{name}").status_code == 404
+    assert client.delete(f"{SMALL}/lens/images/one.png").json() == {"images": []}
+
+
+def test_a_calibration_that_fails_says_why_and_changes_nothing(
+    client: TestClient, finished: Callable[[dict[str, Any]], dict[str, Any]]
+) -> None:
+    wanted = {"files": "uploaded", "board": "9x6", "square_m": 0.025}
+    assert "no checkerboard pictures" in client.post(f"{SMALL}/lens/calibrate", json=wanted).json()["error"]["message"]
+    send(client, "checkerboard", "black.png", cv2.imencode(".png", np.zeros((90, 120), np.uint8))[1].tobytes())
+    assert client.post(f"{SMALL}/lens/calibrate", json=wanted | {"board": "nine"}).status_code == 422
+    revision = client.get(SMALL).json()["revision"]
+    job = finished(client.post(f"{SMALL}/lens/calibrate", json=wanted).json()["job"])
+    assert job["state"] == "failed"
+    assert job["message"].endswith(".")
+    assert client.get(SMALL).json()["revision"] == revision
+    assert client.get(f"{SMALL}/lens/report").status_code == 404
+
+
+def test_frames_are_shown_raw_undistorted_and_smaller(client: TestClient) -> None:
+    for number in (0, 1, 2, 30, 29, 28, 5):
+        picture = client.get(f"{SMALL}/frames/{number}.jpg")
+        pixels = cv2.imdecode(np.frombuffer(picture.content, np.uint8), cv2.IMREAD_COLOR)
+        assert pixels.shape == (120, 160, 3)
+    small = client.get(f"{SMALL}/frames/3.jpg", params={"w": 80, "und": 1}).content
+    assert cv2.imdecode(np.frombuffer(small, np.uint8), cv2.IMREAD_COLOR).shape == (60, 80, 3)
+    answer = client.get(f"{SMALL}/frames/40.jpg")
+    assert (answer.status_code, answer.json()["error"]["kind"]) == (422, "input")
