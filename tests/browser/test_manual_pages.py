@@ -89,7 +89,7 @@ def test_a_new_project_from_files_gets_its_orthoimage_and_twenty_pairs_by_real_c
         page.get_by_role("button", name="New project").first.click()
         page.get_by_label("Name", exact=True).fill("by-hand")
         for kind, file in (("video", "video.mp4"), ("cloud", "site.laz"), ("lens", "lens.yaml")):
-            page.locator(f".file-row[data-kind={kind}]").get_by_role("button").click()
+            page.locator(f".source-row[data-kind={kind}]").get_by_role("button").click()
             files = page.get_by_role("listbox", name="Files")
             if files.get_by_role("option", name="footage").count() or kind == "video":
                 files.get_by_role("option", name="footage").click()
@@ -393,6 +393,71 @@ def test_inputs_are_sent_taken_back_and_calibrated(browser, project, tmp_path):
     assert read_lens(folder / read_project(folder).inputs.lens).focal_px[0] == pytest.approx(
         read_lens(SAMPLE / "lens.yaml").focal_px[0], rel=0.02
     )
+
+
+def test_an_upload_that_is_cancelled_leaves_nothing(browser, project, tmp_path):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/inputs")
+        video = page.locator(".input-card[data-kind=video]")
+        expect(video.locator(".badge")).to_have_text("understood")
+        line = page.context.new_cdp_session(page)
+        slow = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": 400_000}
+        line.send("Network.emulateNetworkConditions", slow)
+        large = tmp_path / "large.mp4"
+        large.write_bytes(bytes(8_000_000))
+        with page.expect_file_chooser() as chooser:
+            video.get_by_role("button", name="Upload…").click()
+        chooser.value.set_files(large)
+        expect(video.locator(".job .numbers")).to_contain_text("MB/s")
+        video.get_by_role("button", name="Cancel").click()
+        expect(video.locator(".job")).to_have_count(0)
+        expect(video.locator(".badge")).to_have_text("understood")
+        page.wait_for_timeout(300)
+    assert not [file for file in folder.rglob("*") if "large" in file.name or file.name.endswith(".part")]
+    assert read_project(folder).inputs.video == "../footage/video.mp4"
+
+
+def test_a_clicked_height_and_a_region_make_a_target_of_points(browser, project, truth):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    (folder / "project.json").write_text(json.dumps(document | {"targets": []}))
+    roof = document["targets"][0]["lines"]
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/orthoimage?view=picture")
+        page.get_by_label("Pixel on the ground").fill("4")
+        page.keyboard.press("Enter")
+        saved(page)
+        page.get_by_role("button", name="Make the orthoimage").click()
+        expect(page.locator("#raster-state")).to_have_text("made", timeout=60_000)
+        ready(page, "Orthoimage")
+        grid = ask(pages, "orthoimage")["grid"]
+        place = np.array(truth.inputs.gps.at_m) + [1.5, 0.3]  # beside the antenna, on the roof
+        pane_of_ground = pane(page, "Orthoimage")
+        page.mouse.click(*fitted(page, pane_of_ground, (grid["width"], grid["height"])).window(ortho_px(grid, place)))
+        expect(page.locator("#height .value").first).to_contain_text("18.")
+        page.get_by_role("button", name="Take this height").click()
+
+        page.goto(f"{pages}/regions?layout=plan")
+        ready(page, "Orthorectified")
+        expect(page.locator("#targets li[data-target=roof]")).to_contain_text("drawing")
+        page.get_by_role("button", name="Actions for roof").click()
+        page.get_by_role("menuitem", name="Delete").click()
+        page.get_by_role("button", name="Add target").click()
+        page.get_by_role("menuitem", name="Textured region").click()
+        grid = ask(pages, "rectified")["grid"]
+        plan = pane(page, "Orthorectified")
+        lies = fitted(page, plan, (grid["width"], grid["height"]))
+        corners = [roof["L1"]["from_m"], roof["L1"]["to_m"], roof["L2"]["to_m"], roof["L2"]["from_m"]]
+        for corner in corners:
+            page.mouse.click(*np.round(lies.window(ortho_px(grid, corner))))
+            page.wait_for_timeout(400)
+        page.keyboard.press("Enter")
+        page.get_by_label("Height above ground").fill("18.3")
+        page.keyboard.press("Enter")
+        saved(page)
+    target = read_project(folder).targets[0]
+    assert (target.kind, target.height_m, len(target.region_m)) == ("points", 18.3, 4)
 
 
 def test_projects_are_copied_renamed_archived_restored_and_deleted_with_undo(browser, project, tmp_path):

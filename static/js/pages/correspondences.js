@@ -183,9 +183,12 @@ const follow = latest(
     const [middle, beside] = seen;
     if (!linked || !middle || !beside) return;
     const ratio = Math.hypot(...offset(points[0], points[1])) / Math.hypot(...offset(middle, beside));
-    const { pane } = counterpart(leader);
+    const follower = counterpart(leader);
+    const { pane } = follower;
     pane.setView(pane.view.centredOn(middle, pane.size, leader.pane.view.scale * ratio), { silent: true });
-    rememberView(counterpart(leader));
+    follower.chrome.refresh();
+    follower.draw();
+    rememberView(follower);
   },
   () => undefined,
 );
@@ -236,7 +239,7 @@ const undistortToggle = toggleButton("Undistorted", "Show the frame without lens
   setView({ und: on ? 1 : null });
   void loadFrame();
 });
-const arrowToggle = toggleButton("Residuals", "Arrows from each mark to where the fit wants it, 50 times enlarged (R)", arrows, (on) => {
+const arrowToggle = toggleButton("Residuals", "Arrows from each mark towards where the fit wants it, enlarged (R)", arrows, (on) => {
   arrows = on;
   showFit();
 });

@@ -19,6 +19,8 @@ import { otherSide } from "./slots.js";
  * @property {(shown: Point) => Point | Promise<Point>} stored
  */
 
+const ARROW_PX = 26; // CSS px for a residual of one px of the picture
+
 /** @type {Mapping} */
 export const identity = { shown: (points) => points, stored: (point) => point };
 
@@ -31,7 +33,6 @@ export class PairPane extends Emitter {
   ghosts = new Map();
   /** @type {Map<number, Point>} from mark to where the fit wants it, px shown */
   residuals = new Map();
-  arrowScale = 50;
   #aims = false;
   /** @type {Promise<void>} */
   #nudges = Promise.resolve();
@@ -80,7 +81,7 @@ export class PairPane extends Emitter {
       const point = this.shown.get(id);
       if (point === undefined) return;
       const offset = this.residuals.get(id);
-      if (offset !== undefined && !look.includes("off")) shapes.push({ id: `residual-${id}`, kind: "arrow", class: "residual", points: [point, add(point, times(offset, this.arrowScale))] });
+      if (offset !== undefined && !look.includes("off")) shapes.push({ id: `residual-${id}`, kind: "arrow", class: "residual", points: [point, add(point, times(offset, this.#arrowScale))] });
       shapes.push({ id: `pair-${id}`, kind: "mark", class: `${look} ${id === selected ? "selected" : ""}`, label: String(id), points: [point], grab: true });
     };
     for (const pair of pairs) mark(pair.id, pair.enabled ? "" : "off");
@@ -93,6 +94,11 @@ export class PairPane extends Emitter {
     this.pane.setShapes(shapes);
     const half = this.slots.waitingFor(this.side);
     this.chrome.setHint(half === null ? "" : `Click completes pair ${half.id}`);
+  }
+
+  /** How much residuals are enlarged: as long on the screen at any zoom, but never shorter than they are. */
+  get #arrowScale() {
+    return Math.max(1, ARROW_PX / this.pane.view.scale);
   }
 
   /** Zoom to a pair. @param {number} id @param {number} scale */
@@ -131,7 +137,7 @@ export class PairPane extends Emitter {
     });
     pane.on("drop", ({ id, point }) => this.#store(point, (stored) => this.slots.move(idOf(id), this.side, stored)));
     pane.on("cancel", () => this.refresh());
-    pane.on("view", () => this.#aims && this.draw());
+    pane.on("view", () => this.draw());
     pane.element.addEventListener("keydown", () => this.#setAim(true));
     pane.element.addEventListener("focus", () => this.#setAim(pane.element.matches(":focus-visible")));
     pane.element.addEventListener("blur", () => this.#setAim(false));

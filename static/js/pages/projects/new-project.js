@@ -32,7 +32,7 @@ export function newProjectDialog() {
           path.className = "path";
           if (name.value === "" && kind === "video") name.value = files[0].split("/").at(-1)?.replace(/\.[^.]+$/, "") ?? "";
         };
-        return h("div", { class: "file-row", "data-kind": kind }, h("span", { class: "label" }, title), path, h("button", { class: "button small", type: "button", onclick: () => void choose() }, icon("folder", "small"), "Browse…"));
+        return h("div", { class: "source-row", "data-kind": kind }, h("span", { class: "label" }, title), path, h("button", { class: "button small", type: "button", onclick: () => void choose() }, icon("folder", "small"), "Browse…"));
       });
       const submit = async (/** @type {Event} */ event) => {
         event.preventDefault();
@@ -44,7 +44,7 @@ export function newProjectDialog() {
         }
       };
       const field = h("div", { class: "field" }, h("label", { class: "label", for: "project-name" }, "Name"), name);
-      const files = h("div", { class: "file-rows" }, rows, h("p", { class: "small faint" }, "Files stay where they are. All of them can be chosen, sent or changed later, in step 1."));
+      const files = h("div", { class: "source-rows" }, rows, h("p", { class: "small faint" }, "Files stay where they are. All of them can be chosen, sent or changed later, in step 1."));
       return [h("form", { class: "dialog-form", onsubmit: submit }, h("div", { class: "dialog-body" }, field, files, problem), dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, "Create")))];
     },
   });
