@@ -136,7 +136,7 @@ def fit_reference(
     height = np.zeros(len(pairs)) if elevation_m is None else np.nan_to_num(elevation_m)
     points = np.column_stack([local, height])
     model = _fit(rays[enabled], points[enabled], has_lens)
-    left_out = [_left_out(number, rays, points, enabled, lens, has_lens) for number in range(len(pairs))]
+    left_out = _left_out(rays, points, enabled, lens, model)
     residuals = tuple(
         _pair_residual(pair, ray, point, model, lens, origin, out)
         for pair, ray, point, out in zip(pairs, rays, points, left_out, strict=True)
@@ -279,19 +279,50 @@ def _normalising(points: Floats) -> Floats:
 
 
 def _left_out(
-    number: int, rays: Floats, points: Floats, enabled: np.ndarray, lens: Lens, has_lens: bool
-) -> tuple[float, float] | None:
-    others = enabled.copy()
-    others[number] = False
-    if others.sum() < 4 or _collinear(points[others, :2]) or _all_but_one_collinear(points[others, :2]):
-        return None
-    try:
-        model = _fit(rays[others], points[others], has_lens)
-    except InputError:
-        return None
-    pixels = (rays[number] - model.rays(points[number])) * lens.focal_px
-    metres = points[number, :2] - model.plan(rays[number], points[number, 2])
-    return float(np.linalg.norm(pixels)), float(np.linalg.norm(metres))
+    rays: Floats, points: Floats, enabled: np.ndarray, lens: Lens, model: _Model
+) -> list[tuple[float, float] | None]:
+    """Return each pair's size of residual, pixels and metres, against the fit of the others; None where none is."""
+    others = enabled & ~np.eye(len(rays), dtype=bool)
+    if model.pose is None:
+        models = _models_without_poses(rays, points, others)
+    else:
+        models = _models_near(rays, points, others, model.pose)
+    errors: list[tuple[float, float] | None] = []
+    for ray, point, chosen, without in zip(rays, points, others, models, strict=True):
+        if without is None or not _determined(points[chosen, :2]):
+            errors.append(None)
+            continue
+        pixels = (ray - without.rays(point)) * lens.focal_px
+        metres = point[:2] - without.plan(ray, point[2])
+        errors.append((float(np.linalg.norm(pixels)), float(np.linalg.norm(metres))))
+    return errors
+
+
+def _determined(ground: Floats) -> bool:
+    return len(ground) >= 4 and not _collinear(ground) and not _all_but_one_collinear(ground)
+
+
+def _models_near(rays: Floats, points: Floats, others: np.ndarray, near: Pose) -> list[_Model | None]:
+    """Return the fit of each row of `others` (N, N), all at once from the pose of the whole fit."""
+    fits = fit_poses(
+        np.repeat(rays[None], len(rays), axis=0), others.astype(np.float64), points, near, iterations=30, robust=False
+    )
+    poses = (Pose(R, centre_m) for R, centre_m in zip(fits.R, fits.centre_m, strict=True))
+    return [
+        _Model(plan_homography(pose), pose) if np.isfinite(pose.centre_m).all() and pose.centre_m[2] > 0 else None
+        for pose in poses
+    ]
+
+
+def _models_without_poses(rays: Floats, points: Floats, others: np.ndarray) -> list[_Model | None]:
+    models: list[_Model | None] = []
+    for chosen in others:
+        try:
+            determined = _determined(points[chosen, :2])
+            models.append(_fit(rays[chosen], points[chosen], False) if determined else None)
+        except InputError:
+            models.append(None)
+    return models
 
 
 def _pair_residual(
