@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import os
 import shutil
 import signal
 import socket
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
 from core.run import run_project
@@ -85,6 +87,12 @@ def _note_outside(url: str, address: str, troubles: list[str]) -> None:
 def _note_failure(status: int, url: str, troubles: list[str]) -> None:
     if status >= 500:
         troubles.append(f"{status} {url}")
+
+
+def shared_folder(factory: pytest.TempPathFactory) -> Path:
+    """A folder of this session that all its test processes see."""
+    own = factory.getbasetemp()
+    return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
 
 
 def measured_scene(shared: Path) -> Path:

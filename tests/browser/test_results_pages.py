@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Response, expect
 
 from core.drift import high_pass
 from core.project import read_project
 from core.results import read_history_csv
-from tests.browser.live import ask, chromium, free_port, measured_scene, serving, watched
+from tests.browser.live import ask, chromium, free_port, measured_scene, serving, shared_folder, watched
 
 FRAMES = 240
 FRAME = 120  # in the middle of the shaking
@@ -23,7 +23,7 @@ WITHIN_PX = 0.5
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    return measured_scene(tmp_path_factory.getbasetemp().parent / "results-pages")
+    return measured_scene(shared_folder(tmp_path_factory) / "measured-scene")
 
 
 @pytest.fixture(scope="module")
@@ -40,11 +40,19 @@ def server(tmp_path_factory):
         yield workspace, address
 
 
+@pytest.fixture(scope="module")
+def finished(scene, server):
+    """The address of a project's pages that no test changes."""
+    workspace, address = server
+    shutil.copytree(scene, workspace / "finished")
+    return f"{address}/p/finished"
+
+
 @pytest.fixture
 def project(scene, server, request):
-    """A project of its own for each test, measured by the headless engine: its folder and its pages' address."""
+    """A project of its own for a test that changes it: its folder and its pages' address."""
     workspace, address = server
-    name = re.sub(r"[^a-z0-9]+", "-", request.node.name)[:40]
+    name = re.sub(r"[^a-z0-9]+", "-", request.node.name)[5:].strip("-")
     shutil.copytree(scene, workspace / name)
     return workspace / name, f"{address}/p/{name}"
 
@@ -67,6 +75,7 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
         expect(page.get_by_role("link", name="Review the result")).to_be_visible(timeout=60_000)
         page.goto(f"{address}/p/small/export")
         with page.expect_download() as download:
+            page.wait_for_selector("a[data-main]")
             page.keyboard.press("d")
         assert download.value.suggested_filename.endswith("roof.csv")
         downloaded = Path(download.value.path()).read_bytes()
@@ -80,28 +89,40 @@ def at_rest(page: Page, frame: int) -> None:
 
 
 @pytest.mark.parametrize("ratio", [1, 2])
-@pytest.mark.parametrize("zooms", [0, 3])
-def test_the_overlay_lies_where_the_engine_measured(browser, project, ratio, zooms):
-    _, pages = project
-    with watched(browser, pages, device_scale_factor=ratio) as page:
-        page.goto(f"{pages}/review?frame={FRAME}&hidden=rejected,bands,edges")
+def test_the_overlay_lies_where_the_engine_measured(browser, finished, ratio):
+    measured = ask(finished, f"review/{FRAME}")
+    with watched(browser, finished, device_scale_factor=ratio) as page:
+        page.goto(f"{finished}/review?frame={FRAME}&hidden=rejected,bands,edges")
         at_rest(page, FRAME)
-        page.locator(".review-frame").focus()
-        for _ in range(zooms):
-            page.keyboard.press("+")
-        page.wait_for_timeout(200)
-        measured = ask(pages, f"review/{FRAME}")
-        to_canvas = placed_by(page, (960, 540), 1.4**zooms)
+        box = page.locator(".review-frame").bounding_box()
+        to_canvas = whole_picture(box)
         marks_agree(page, measured["targets"]["roof"], to_canvas)
         features_agree(page, np.array(measured["ground"]["used"]), to_canvas, ratio)
+        at = np.array([0.3 * box["width"], 0.2 * box["height"]])
+        page.mouse.move(box["x"] + at[0], box["y"] + at[1])
+        page.mouse.wheel(0, -500)
+        page.mouse.move(box["x"] + box["width"] - 30, box["y"] + 30)
+        closer = zoomed(to_canvas, at, np.exp(500 * 0.0016))
+        page.wait_for_function(MARK_IS_NEAR, arg=closer(measured["targets"]["roof"]["p1_raw"]).tolist())
+        marks_agree(page, measured["targets"]["roof"], closer)
+        features_agree(page, np.array(measured["ground"]["used"]), closer, ratio)
 
 
-def placed_by(page: Page, video, zoom):
+MARK_IS_NEAR = """([x, y]) => {
+    const place = document.querySelector('[data-id="roof/p1"]').transform.baseVal.getItem(0).matrix;
+    return Math.hypot(place.e - x, place.f - y) < 5;
+}"""
+
+
+def whole_picture(box):
     """The rule of the pixel's centre, written down again: (0, 0) is half a pixel inside the picture's corner."""
-    box = page.locator(".review-frame").bounding_box()
-    size = np.array([box["width"], box["height"]])
-    scale = zoom * min(size / np.array(video))
-    return lambda raw: scale * (np.asarray(raw, dtype=float) + 0.5 - np.array(video) / 2) + size / 2
+    size, video = np.array([box["width"], box["height"]]), np.array([960, 540])
+    scale = min(size / video)
+    return lambda raw: scale * (np.asarray(raw, dtype=float) + 0.5 - video / 2) + size / 2
+
+
+def zoomed(to_canvas, at, factor):
+    return lambda raw: at + factor * (to_canvas(raw) - at)
 
 
 def marks_agree(page: Page, roof, to_canvas):
@@ -150,17 +171,16 @@ def features_agree(page: Page, used, to_canvas, ratio):
     assert np.abs(np.array(middles) - alone).max() < WITHIN_PX
 
 
-def test_the_next_frame_comes_quickly_and_the_plot_and_player_lead_each_other(browser, project):
-    _, pages = project
-    with watched(browser, pages) as page:
-        page.goto(f"{pages}/review?frame={FRAME}")
+def test_the_next_frame_comes_quickly_and_the_plot_and_player_lead_each_other(browser, finished):
+    with watched(browser, finished) as page:
+        page.goto(f"{finished}/review?frame={FRAME}")
         at_rest(page, FRAME)
         steps_ms = []
         for frame in range(FRAME + 1, FRAME + 9):
             page.wait_for_timeout(150)
             steps_ms.append(page.evaluate(TIMED_STEP, frame))
         assert np.median(steps_ms) < 150, steps_ms
-        history = ask(pages, "results/roof")
+        history = ask(finished, "results/roof")
         area = page.locator(".review-plots .u-over").first.bounding_box()
         page.mouse.click(area["x"] + 0.25 * area["width"], area["y"] + 30)
         times = history["time_s"]
@@ -228,14 +248,11 @@ def test_the_corner_slider_shows_what_the_engine_filters(browser, project):
         before = read_project(folder).drift.corner_hz
         slider = page.get_by_role("slider", name="Corner frequency")
         slider.focus()
-        answers = []
-        for _ in range(4):
-            with page.expect_response(lambda answer: answer.url.endswith("/drift")) as asked:
+        corner = before + 4 * 0.005
+        with page.expect_response(lambda answer: answer.url.endswith("/drift") and asks_for(answer, corner)) as asked:
+            for _ in range(4):
                 slider.press("ArrowRight")
-            answers.append(asked.value)
-        corner = json.loads(answers[-1].request.post_data)["corner_hz"]
-        assert corner == pytest.approx(before + 4 * 0.005)
-        answer = answers[-1].json()
+        answer = asked.value.json()
         expected = high_pass(history.p1_raw_m, history.time_s, corner)
         drawn = np.array([answer["filtered"]["dx"], answer["filtered"]["dy"]], dtype=float).T
         np.testing.assert_allclose(drawn, expected, atol=1e-6)
@@ -244,6 +261,10 @@ def test_the_corner_slider_shows_what_the_engine_filters(browser, project):
         page.wait_for_function("() => document.querySelector('.save-state').dataset.state === 'saved'")
         expect(page.locator(".warnings")).not_to_be_empty()
         assert read_project(folder).drift.corner_hz == pytest.approx(corner)
+
+
+def asks_for(answer: Response, corner: float) -> bool:
+    return json.loads(answer.request.post_data)["corner_hz"] == pytest.approx(corner)
 
 
 def hovered_value(page: Page, label: str) -> float:
@@ -277,11 +298,10 @@ def test_the_interval_of_rest_is_dragged_on_the_plot(browser, project):
         assert read_project(folder).intervals_s.pre_event[1] == pytest.approx(end - 1, abs=0.002)
 
 
-def test_table_2_says_what_the_summary_says(browser, project):
-    folder, pages = project
-    gps = json.loads((folder / "results" / "summary.json").read_text())["targets"]["roof"]["gps"]
-    with watched(browser, pages) as page:
-        page.goto(f"{pages}/export")
+def test_table_2_says_what_the_summary_says(browser, scene, finished):
+    gps = json.loads((scene / "results" / "summary.json").read_text())["targets"]["roof"]["gps"]
+    with watched(browser, finished) as page:
+        page.goto(f"{finished}/export")
         row = page.locator(".comparison tbody tr").first
         expect(row).to_contain_text("East")
         cells = [cell.replace("−", "-") for cell in row.locator("td").all_inner_texts()]

@@ -5,6 +5,7 @@ import { fill, find, h } from "../lib/dom.js";
 import { fixed, millimetres } from "../lib/format.js";
 import { newestOnly } from "../lib/newest.js";
 import { setView, viewText } from "../lib/view-state.js";
+import { busyOver } from "../components/busy.js";
 import { AXES, fetchHistory, fetchResults } from "../components/histories.js";
 import { INTERVALS, intervalFields } from "../components/interval-fields.js";
 import { whenMeasured } from "../components/measured.js";
@@ -66,7 +67,7 @@ const history = new Plot(mainArea, { title: "Displacement", unit: "m", drag: "se
 const sweepPlot = new Plot(lowerArea, { title: "RMS before the event", unit: "m", xUnit: "Hz", drag: "seek", zeroY: true, seekStep: CORNER_STEP_HZ });
 const spectrumPlot = new Plot(lowerArea, { title: "Spectrum", unit: "m", xUnit: "Hz", drag: "view", logX: true, logY: true });
 const fields = intervalFields(intervalBox, saveInterval);
-const refilter = newestOnly(askFilter, showAnswer, toastError);
+const refilter = newestOnly(askFilter, showAnswer, (error) => (opened(), toastError(error)));
 const resweep = newestOnly(askSweep, showSweep, (error) => showSweepProblem(error));
 const respectrum = newestOnly(askSpectra, showSpectra, () => undefined);
 const solver = new Solver(page, () => results.ready && !results.stale, (busy) => (solving.hidden = !busy));
@@ -87,6 +88,7 @@ page.keys([
   { keys: "Wheel", group: "Plots", label: "Zoom; Alt+drag pans, a double click shows all" },
 ]);
 onProject();
+const opened = busyOver(mainArea, "Solving…");
 await reload().catch(toastError);
 
 function stageElement() {
@@ -148,6 +150,7 @@ async function askSpectra([start, end]) {
 /** @param {DriftAnswer} newest */
 function showAnswer(newest) {
   answer = newest;
+  opened();
   drawHistory();
   showFigures();
   fill(warnings, newest.warnings.map((words) => note("warn", words)), newest.warnings.length ? null : note("good", "This corner frequency takes away nothing an engineer would miss."));

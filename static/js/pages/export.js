@@ -1,10 +1,11 @@
 // Validate and export: the history against GPS, the rows of the paper's Table 2, and everything to take home.
 
-import { get, post, projectPath } from "../lib/api.js";
+import { get, post, projectPath, sentence } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { centimetres, fixed, millimetres, plural, size } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
 import { setView, viewText } from "../lib/view-state.js";
+import { busyOver } from "../components/busy.js";
 import { stepUrl } from "../components/header.js";
 import { AXES, fetchHistory, fetchResults } from "../components/histories.js";
 import { isRunning, jobCard } from "../components/job-card.js";
@@ -72,22 +73,38 @@ page.events.on("results", () => void reload().catch(toastError));
 page.events.on("job", onJob);
 page.keys([
   { keys: "A", group: "Validate", label: "East or north", run: () => chooseAxis(axis === "x" ? "y" : "x") },
-  { keys: "D", group: "Export", label: "Download the displacement history", run: () => find("a[data-main]", HTMLAnchorElement).click() },
+  { keys: "D", group: "Export", label: "Download the displacement history", run: () => find("a[data-main]", HTMLAnchorElement).click(), when: () => document.querySelector("a[data-main]") !== null },
   { keys: "Wheel", group: "Plots", label: "Zoom in time; a drag pans, a double click shows all" },
 ]);
 showArchive();
 await reload().catch(toastError);
 
+/** What the files say comes first; the curves follow, since the engine may have to solve for them. */
 async function reload() {
   results = await fetchResults(page.id);
   problem = "";
-  validation = null;
-  const { drift } = page.store.project;
+  showAll();
+  await loadCurves();
+  showAll();
+}
+
+async function loadCurves() {
+  const { inputs, drift } = page.store.project;
+  const done = busyOver(overlayBox, "Solving for the curves…");
   const corner_hz = drift.filter === "high-pass" ? drift.corner_hz : null;
-  history = await fetchHistory(page.id, target);
-  if (page.store.project.inputs.gps !== null) {
-    validation = await get(projectPath(page.id, "validation", { target, corner_hz })).catch((error) => ((problem = error.message), null));
+  try {
+    if (inputs.gps === null) validation = null;
+    else validation = await get(projectPath(page.id, "validation", { target, corner_hz }));
+    if (validation === null) history = await fetchHistory(page.id, target);
+  } catch (error) {
+    problem = sentence(error);
+    history = await fetchHistory(page.id, target);
+  } finally {
+    done();
   }
+}
+
+function showAll() {
   draw();
   showGps();
   showTable();
@@ -129,7 +146,7 @@ function joined(a, b, key) {
 
 function showGps() {
   const given = page.store.project.inputs.gps !== null;
-  const rms = validation?.rms_m;
+  const compared = validation ?? results.summary?.targets?.[target]?.gps ?? null;
   const figure = (/** @type {string} */ value, /** @type {string} */ name) => h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
   fill(
     gpsBox,
@@ -137,12 +154,12 @@ function showGps() {
     given ? null : note("info", "No GPS record is given, so there is nothing to compare with. Peaks and residual below come from the video alone."),
     given ? null : h("div", { class: "toolbar" }, h("a", { class: "button small", href: stepUrl(page.id, "inputs") }, "Add a GPS record")),
     problem ? note("warn", problem) : null,
-    validation?.message ? note("warn", validation.message) : null,
-    validation?.gps && h("div", { class: "figures" },
-      figure(rms ? millimetres(rms.x, 1) : "–", "RMS error, east"),
-      figure(rms ? millimetres(rms.y, 1) : "–", "RMS error, north"),
-      figure(lagWords(validation.lag_s), "clock lag, applied")),
-    validation?.gps ? h("p", { class: "small soft" }, lagSentence(validation)) : null,
+    compared?.message ? note("warn", compared.message) : null,
+    compared && h("div", { class: "figures" },
+      figure(millimetres(compared.rms_m?.x, 1), "RMS error, east"),
+      figure(millimetres(compared.rms_m?.y, 1), "RMS error, north"),
+      figure(lagWords(compared.lag_s), "clock lag, applied")),
+    compared && h("p", { class: "small soft" }, lagSentence(compared)),
   );
 }
 
@@ -159,8 +176,21 @@ function lagSentence({ lag_s, lag_sigma_s }) {
 }
 
 function showTable() {
-  const rows = validation?.table ?? [];
+  const rows = validation?.table ?? rowsOf(results.summary?.targets?.[target]?.gps);
   fill(tableBox, h("header", {}, h("h2", {}, rows.length ? "Peaks and residual, video and GPS" : "Peaks and residual"), h("span", { class: "badge" }, target)), rows.length ? comparisonTable(rows) : summaryTable());
+}
+
+/**
+ * Rows of the comparison as the summary keeps them.
+ * @param {any} gps of a target in summary.json
+ * @returns {TableRow[]}
+ */
+function rowsOf(gps) {
+  if (!gps) return [];
+  return QUANTITIES.flatMap(({ name }) => AXES.flatMap(({ value }) => {
+    const row = gps[`${name}_m`]?.[value];
+    return row ? [{ quantity: name, axis: value, video_m: row.video, gps_m: row.gps, error_m: row.error, error_percent: row.error_percent }] : [];
+  }));
 }
 
 /** The paper's Table 2: a row per axis. @param {TableRow[]} rows */

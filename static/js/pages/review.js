@@ -4,6 +4,7 @@ import { get, projectPath } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { count, fixed, plural } from "../lib/format.js";
 import { setView, viewNumber, viewText } from "../lib/view-state.js";
+import { busyOver } from "../components/busy.js";
 import { ExclusionEditor } from "../components/exclusions.js";
 import { FrameLibrary } from "../components/frames.js";
 import { FrameView } from "../components/frame-view.js";
@@ -83,7 +84,9 @@ listen();
 page.keys(keys());
 showLayers();
 view.setLayers(layers);
+const opened = busyOver(stageBody, "Solving…");
 await loadHistories().catch(toastError);
+opened();
 chooseStage(stage);
 player.go(viewNumber("frame", store.project.reference_frame));
 

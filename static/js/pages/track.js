@@ -18,6 +18,10 @@ import { announce, toastError } from "../components/toast.js";
 /** @typedef {[frame: number, time_s: number, dx_m: number | null, dy_m: number | null, status: string]} Row */
 /** @typedef {{job: Job | null, resumable: boolean, frames_done: number, frames_total: number, message: string | null, preview: Record<string, Row[]>}} TrackState */
 
+// The stage of a measurement that counts frames; the others are short.
+const MEASURING = "measuring";
+/** @type {Record<string, string>} */
+const STAGES = { cloud: "Reading the cloud", measuring: "Measuring frames", solving: "Solving", orthoimage: "Making the orthoimage", "drawing figures": "Drawing figures" };
 /** Where each part of project.json is decided. @type {{path: string, step: import("../lib/types.js").StepName, name: string}[]} */
 const PLACES = [
   { path: "inputs", step: "inputs", name: "Inputs" },
@@ -112,7 +116,7 @@ async function loadHistory() {
 function onJob(job) {
   if (job.kind !== "track") return;
   const ended = isRunning(track.job) && !isRunning(job);
-  track = { ...track, job, frames_done: Math.max(job.done, track.frames_done), frames_total: job.total || track.frames_total };
+  track = { ...track, job };
   if (ended) {
     announce(job.state === "done" ? "The measurement is finished." : `The measurement stopped. ${job.message ?? ""}`);
     void catchUp();
@@ -233,19 +237,25 @@ function buttons(done) {
 /** @param {Job} job */
 function showRunning(job) {
   const share = job.total > 0 ? job.done / job.total : null;
-  const figure = (/** @type {string} */ value, /** @type {string} */ name) => h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
   const bar = h("progress", { max: 1, "aria-label": "Progress", value: share });
+  const title = job.state === "queued" ? "Waiting for its turn" : (STAGES[job.stage] ?? (job.stage || "Starting"));
   fill(
     controls,
-    h("header", {}, h("h2", {}, job.state === "queued" ? "Waiting for its turn" : job.stage ? job.stage[0].toUpperCase() + job.stage.slice(1) : "Starting"), h("span", { class: "number soft" }, share === null ? "" : `${fixed(100 * share, 0)} %`)),
+    h("header", {}, h("h2", {}, title), h("span", { class: "number soft" }, share === null ? "" : `${fixed(100 * share, 0)} %`)),
     bar,
-    h("div", { class: "figures" },
-      figure(job.total ? `${count(job.done)} / ${count(job.total)}` : "–", "frames"),
-      figure(job.rate_per_s ? fixed(job.rate_per_s, 1) : "–", "frames/s"),
-      figure(duration(job.seconds_left), "left")),
+    job.stage === MEASURING ? measuringFigures(job) : null,
     h("p", { class: "small faint" }, "You may close this tab: the measurement goes on, and every frame is kept."),
     h("div", { class: "toolbar" }, h("button", { type: "button", class: "button", onclick: () => void cancel() }, icon("close"), "Cancel")),
   );
+}
+
+/** @param {Job} job */
+function measuringFigures(job) {
+  const figure = (/** @type {string} */ value, /** @type {string} */ name) => h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
+  return h("div", { class: "figures" },
+    figure(`${count(job.done)} / ${count(job.total)}`, "frames"),
+    figure(job.rate_per_s ? fixed(job.rate_per_s, 1) : "–", "frames/s"),
+    figure(duration(job.seconds_left), "left"));
 }
 
 function stoppedWords() {
