@@ -11,6 +11,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from core.errors import InputError
 from core.lens import Lens
-from core.video import frame_index, read_frames_rgb
+from core.video import FrameIndex, frame_index, read_frames_rgb
 
 Picture = NDArray[np.uint8]
 Fingerprint = tuple[str, int, int]
@@ -137,15 +138,25 @@ class _Reader:
 
     def __init__(self, video: Path, key: Fingerprint, frames: ByteCache) -> None:
         self._video, self._key, self._frames = video, key, frames
-        index = frame_index(video)
-        self.count = len(index)
-        self._key_frames = [bisect.bisect_left(index.ticks, tick) for tick in index.key_ticks]
         self._stream: Generator[tuple[int, Picture], None, None] | None = None
         self._next = 0
         self._lock = threading.Lock()
 
+    @cached_property
+    def _index(self) -> FrameIndex:
+        return frame_index(self._video)
+
+    @property
+    def count(self) -> int:
+        return len(self._index)
+
+    @cached_property
+    def _key_frames(self) -> list[int]:
+        return [bisect.bisect_left(self._index.ticks, tick) for tick in self._index.key_ticks]
+
     def frame(self, number: int) -> Picture:
-        if not 0 <= number < self.count:
+        # The first picture of a video that was just added is there at once: only others need to know where they lie.
+        if number != 0 and not 0 <= number < self.count:
             raise InputError(
                 f"{self._video.name}: has frames 0 to {self.count - 1}, so there is no frame {number}; choose another."
             )
@@ -177,12 +188,16 @@ class _Reader:
         raise InputError(f"{self._video.name}: frame {number} cannot be decoded; export the video again.")
 
     def _may_read_on(self, number: int) -> bool:
+        if number == self._next:
+            return True
         gap = number - self._next
         key_frame = self._key_frame_before(number)
         return gap >= 0 and (gap <= _READ_ON or key_frame <= self._next) and not key_frame > self._next + 8
 
     def _start_for(self, number: int) -> int:
         """Where to begin so that steps back from here are quick: a few frames earlier, if they were just asked for."""
+        if number == 0:
+            return 0
         stepping_back = self._stream is not None and number < self._next <= number + _READ_ON
         if not stepping_back:
             return number

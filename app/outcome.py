@@ -18,6 +18,7 @@ import numpy as np
 
 from app.errors import ApiError, NotYet
 from app.frames import Fingerprint, fingerprint
+from app.jobs import JOB_FILE
 from app.store import ProjectFolder, read_json, stored_inputs
 from core.errors import InputError
 from core.export import SUMMARY_FILE, GpsCheck, Results, compared_with_gps
@@ -50,7 +51,8 @@ class Outcome:
     Attributes:
         ready: whether a run has left results.
         stale: whether the project or an input has changed since.
-        frames_done, frames_total: of the measurement the project wants now.
+        frames_done, frames_total, finished: of the measurement the project wants now.
+        failure: why the last measurement failed; empty where it did not.
         counts: frames of each status, worst target first where there are several.
     """
 
@@ -89,9 +91,17 @@ def state_of(folder: ProjectFolder, project: Project) -> Outcome:
         frames_done=recorded.frames,
         frames_total=_frames_total(folder, project),
         finished=recorded.finished,
+        failure=_failure(folder),
         counts=counts,
         summary=summary if ready else None,
     )
+
+
+def _failure(folder: ProjectFolder) -> str:
+    """Return why the last measurement failed; empty where it did not."""
+    note = read_json(folder.results / JOB_FILE)
+    failed = isinstance(note, dict) and note.get("kind") == "track" and note.get("state") == "failed"
+    return str(note["message"]) if failed else ""
 
 
 def _is_stale(folder: ProjectFolder, project: Project, summary: dict[str, Any]) -> bool:

@@ -28,6 +28,7 @@ from app.frames import FrameStore
 from app.growing import Growing
 from app.guards import LOOPBACK, Guard
 from app.jobs import Jobs
+from app.locks import take_charge
 from app.outcome import Outcomes
 from app.places import Places
 from app.scene3d import Scene3D
@@ -81,10 +82,16 @@ def create_app(workspace: Path, roots: Sequence[Path] = ()) -> FastAPI:
 @contextlib.asynccontextmanager
 async def _life(app: FastAPI) -> AsyncIterator[None]:
     context: Context = app.state.context
-    await run_in_threadpool(_tidy_and_go_on, context)
-    yield
-    context.hub.close()
-    await run_in_threadpool(_stop, context)
+    charge = take_charge(context.workspace.folder)
+    if charge is not None:
+        await run_in_threadpool(_tidy_and_go_on, context)
+    try:
+        yield
+    finally:
+        context.hub.close()
+        await run_in_threadpool(_stop, context)
+        if charge is not None:
+            charge.close()
 
 
 def _tidy_and_go_on(context: Context) -> None:

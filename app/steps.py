@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from app import orthoimages, outcome
@@ -26,6 +26,9 @@ _GOOD_COVERAGE = 0.5
 
 Step = dict[str, str]
 
+_PROBLEMS_KEPT = 32
+_known_problems: dict[Any, list[str]] = {}
+
 
 @dataclass(frozen=True)
 class Facts:
@@ -35,13 +38,31 @@ class Facts:
     problems: list[str] | None
 
 
+@dataclass(frozen=True)
+class _Look:
+    """A project that is being looked at; what costs something is found out once."""
+
+    here: Context
+    folder: ProjectFolder
+    project: Project
+
+    @cached_property
+    def outcome(self) -> outcome.Outcome:
+        return outcome.state_of(self.folder, self.project)
+
+    def is_running(self, kind: str) -> bool:
+        job = self.here.jobs.running(self.folder.id, kind)
+        return job is not None and job.kind == kind
+
+
 def steps_of(here: Context, folder: ProjectFolder, project: Project, *, look: bool = True) -> Facts:
     """Return how far a project has come.
 
     Args:
         look: whether to look for problems now, which opens every input; otherwise what was found before is told.
     """
-    checks: dict[str, Callable[[Context, ProjectFolder, Project], Step]] = {
+    seen = _Look(here, folder, project)
+    checks: dict[str, Callable[[_Look], Step]] = {
         "inputs": _inputs,
         "orthoimage": _orthoimage,
         "correspondences": _correspondences,
@@ -51,9 +72,7 @@ def steps_of(here: Context, folder: ProjectFolder, project: Project, *, look: bo
         "drift": _drift,
         "export": _export,
     }
-    return Facts(
-        {name: check(here, folder, project) for name, check in checks.items()}, _problems(folder, project, look)
-    )
+    return Facts({name: check(seen) for name, check in checks.items()}, _problems(folder, project, look))
 
 
 def steps_of_broken(message: str) -> dict[str, Step]:
@@ -65,13 +84,13 @@ def _step(status: str, message: str) -> Step:
     return {"status": status, "message": message}
 
 
-def _inputs(here: Context, folder: ProjectFolder, project: Project) -> Step:
+def _inputs(seen: _Look) -> Step:
     missing, given = [], []
-    for kind, file in stored_inputs(project.inputs).items():
+    for kind, file in stored_inputs(seen.project.inputs).items():
         if file is None:
             continue
         try:
-            path = folder.input_path(kind, project)
+            path = seen.folder.input_path(kind, seen.project)
         except ApiError as error:
             return _step("error", error.message)
         if path is None or not path.is_file():
@@ -82,17 +101,17 @@ def _inputs(here: Context, folder: ProjectFolder, project: Project) -> Step:
         return _step("todo", "Choose the video, or send it.")
     if missing:
         return _step("error", f"Not found: {', '.join(missing)}; choose it again.")
-    if project.method == "geometric" and "lens" not in given:
+    if seen.project.method == "geometric" and "lens" not in given:
         return _step("warn", "The geometric method needs the lens; calibrate it or choose its file.")
     return _step("done", ", ".join(given))
 
 
-def _orthoimage(here: Context, folder: ProjectFolder, project: Project) -> Step:
-    if here.jobs.running(folder.id, "orthoimage") and _running(here, folder, "orthoimage"):
+def _orthoimage(seen: _Look) -> Step:
+    if seen.is_running("orthoimage"):
         return _step("running", "The orthoimage is being made.")
-    if project.inputs.cloud is None:
+    if seen.project.inputs.cloud is None:
         return _step("done", "Without a cloud, ground coordinates are typed in.")
-    state = orthoimages.state_of(folder, project)
+    state = orthoimages.state_of(seen.folder, seen.project)
     if not state.ready:
         return _step("todo", "Make the orthoimage from the cloud.")
     if state.stale:
@@ -100,17 +119,12 @@ def _orthoimage(here: Context, folder: ProjectFolder, project: Project) -> Step:
     return _step("done", "")
 
 
-def _running(here: Context, folder: ProjectFolder, kind: str) -> bool:
-    job = here.jobs.running(folder.id, kind)
-    return job is not None and job.kind == kind
-
-
-def _correspondences(here: Context, folder: ProjectFolder, project: Project) -> Step:
-    enabled = sum(pair.enabled for pair in project.correspondences)
+def _correspondences(seen: _Look) -> Step:
+    enabled = sum(pair.enabled for pair in seen.project.correspondences)
     if enabled < 4:
         return _step("todo", f"{enabled} pairs of at least 4, better 20.")
     try:
-        fit = reference_fit(here, folder, project)
+        fit = reference_fit(seen.here, seen.folder, seen.project)
     except (InputError, ApiError) as error:
         return _step("error", problem_of(error))
     message = f"{enabled} pairs, {fit.rms_px:.2f} px, {100 * fit.rms_m:.1f} cm"
@@ -122,36 +136,36 @@ def _correspondences(here: Context, folder: ProjectFolder, project: Project) -> 
     return _step("done", message)
 
 
-def _regions(here: Context, folder: ProjectFolder, project: Project) -> Step:
+def _regions(seen: _Look) -> Step:
     todo = []
-    if not project.moving_regions_px:
+    if not seen.project.moving_regions_px:
         todo.append("outline what moves")
-    if not project.targets:
+    if not seen.project.targets:
         todo.append("add a target with its bands")
-    if project.method == "geometric" and any(target.height_m is None for target in project.targets):
+    if seen.project.method == "geometric" and any(target.height_m is None for target in seen.project.targets):
         todo.append("give each target its height")
     if todo:
         return _step("todo", (", ".join(todo) + ".").capitalize())
-    return _step("done", ", ".join(target.name for target in project.targets))
+    return _step("done", ", ".join(target.name for target in seen.project.targets))
 
 
-def _track(here: Context, folder: ProjectFolder, project: Project) -> Step:
-    if _running(here, folder, "track"):
+def _track(seen: _Look) -> Step:
+    if seen.is_running("track"):
         return _step("running", "Tracking.")
-    state = outcome.state_of(folder, project)
+    state = seen.outcome
     if state.ready and not state.stale:
         return _step("done", f"{state.frames_done} frames")
     if state.failure:
         return _step("error", state.failure)
-    if 0 < state.frames_done < state.frames_total:
+    if state.frames_done > 0 and not state.finished:
         return _step("warn", f"Stopped after {state.frames_done} of {state.frames_total} frames; go on.")
     if state.ready:
         return _step("stale", "The project has changed since; track again.")
     return _step("todo", "Not tracked yet.")
 
 
-def _review(here: Context, folder: ProjectFolder, project: Project) -> Step:
-    state = outcome.state_of(folder, project)
+def _review(seen: _Look) -> Step:
+    state = seen.outcome
     if not state.ready:
         return _step("todo", "After tracking.")
     lost, weak = state.counts.get("lost", 0), state.counts.get("weak", 0)
@@ -160,19 +174,19 @@ def _review(here: Context, folder: ProjectFolder, project: Project) -> Step:
     return _step("stale" if state.stale else "done", "No weak or lost frame")
 
 
-def _drift(here: Context, folder: ProjectFolder, project: Project) -> Step:
-    if not outcome.state_of(folder, project).ready:
+def _drift(seen: _Look) -> Step:
+    if not seen.outcome.ready:
         return _step("todo", "After tracking.")
-    if project.intervals_s.pre_event is None:
+    if seen.project.intervals_s.pre_event is None:
         return _step("todo", "Drag the pre-event interval on the plot.")
-    if project.method == "paper" and project.drift.filter == "none":
+    if seen.project.method == "paper" and seen.project.drift.filter == "none":
         return _step("warn", "The paper's method leaves the camera's drift in; choose a high-pass filter.")
-    chosen = project.drift
+    chosen = seen.project.drift
     return _step("done", "No filter" if chosen.filter == "none" else f"High-pass at {chosen.corner_hz:g} Hz")
 
 
-def _export(here: Context, folder: ProjectFolder, project: Project) -> Step:
-    state = outcome.state_of(folder, project)
+def _export(seen: _Look) -> Step:
+    state = seen.outcome
     if not state.ready:
         return _step("todo", "After tracking.")
     return _step("stale", "Results are older than the project.") if state.stale else _step("done", "")
@@ -180,23 +194,13 @@ def _export(here: Context, folder: ProjectFolder, project: Project) -> Step:
 
 def _problems(folder: ProjectFolder, project: Project, look: bool) -> list[str] | None:
     key = (str(folder.folder), project_json(project), _stamps(folder, project))
-    if not look:
-        return _found_problems.get(key)
-    found = _look(key)
-    _found_problems.clear()
-    _found_problems[key] = found
-    return found
-
-
-_found_problems: dict[Any, list[str]] = {}
-
-
-@lru_cache(maxsize=64)
-def _look(key: tuple[str, str, tuple[Any, ...]]) -> list[str]:
-    from pathlib import Path
-
-    place = f"{key[0]}{os.sep}"
-    return [problem.replace(place, "") for problem in check_project(Path(key[0]), with_cloud=False)]
+    if look and key not in _known_problems:
+        place = f"{folder.folder}{os.sep}"
+        found = [problem.replace(place, "") for problem in check_project(folder.folder, with_cloud=False)]
+        while len(_known_problems) >= _PROBLEMS_KEPT:
+            _known_problems.pop(next(iter(_known_problems)), None)
+        _known_problems[key] = found
+    return _known_problems.get(key)
 
 
 def _stamps(folder: ProjectFolder, project: Project) -> tuple[Any, ...]:

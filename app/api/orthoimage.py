@@ -24,7 +24,7 @@ from core.project import Project
 
 router = APIRouter(prefix="/api/projects/{project_id}")
 
-_PIXELS = 12_000_000
+_PIXELS = 8_000_000
 Pixels = Annotated[int, Query(ge=10_000, le=60_000_000)]
 
 

@@ -16,6 +16,7 @@ from fastapi.testclient import TestClient
 
 from app.archives import archive_stream
 from app.context import Context
+from app.locks import LOCK_FILE
 
 SMALL = "/api/projects/small"
 
@@ -40,7 +41,7 @@ def project(workspace: Path) -> bytes:
 
 
 def names(workspace: Path) -> list[str]:
-    return sorted(path.name for path in workspace.iterdir())
+    return sorted(path.name for path in workspace.iterdir() if path.name != LOCK_FILE)
 
 
 def test_an_archive_comes_back_as_it_was(client: TestClient, workspace: Path) -> None:
