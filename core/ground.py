@@ -19,7 +19,7 @@ from core.lens import Lens
 from core.patches import HALF_PX, MARGIN_PX, Matches, PatchTracker
 from core.video import Luma
 
-FEATURES = 420
+FEATURES = 300
 # Correlation below which a patch shows something else than in the reference frame.
 LEAST_SCORE = 0.6
 # Ground points needed before a frame's homography is believed.
@@ -192,6 +192,8 @@ def fit_homography(source: Floats, target: Floats, *, tolerance: float) -> tuple
     Args:
         source, target: (N, 2), rays.
     """
+    if len(source) < 4:
+        return None, np.zeros(len(source), dtype=bool)
     H, mask = cv2.findHomography(source, target, cv2.RANSAC, 3.0 * tolerance, maxIters=300, confidence=0.999)
     # OpenCV's stubs promise a matrix, but degenerate points give none.
     found: Floats | None = None if H is None else np.asarray(H, dtype=np.float64)

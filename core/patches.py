@@ -24,9 +24,9 @@ Singles = NDArray[np.float32]
 
 HALF_PX = 10  # patches of 21 x 21 pixels: 400 of them are 0.18 megapixel
 MARGIN_PX = 6  # room for deformation and for the interpolation kernel
-OVERSAMPLING = 3  # linear interpolation between thirds of a pixel errs below the noise of 8-bit video
+OVERSAMPLING = 2  # linear interpolation between half pixels errs below the noise of 8-bit video
 MAX_ITERATIONS = 8
-CONVERGED_PX = 2e-3
+CONVERGED_PX = 0.01  # each step leaves about a tenth of its own length
 # A patch that wanders further than this from its prediction has lost its own minimum.
 MAX_WANDER_PX = 5.0
 
@@ -90,13 +90,15 @@ class PatchTracker:
     ) -> tuple[Floats, Floats]:
         centre = np.rint(predicted_raw)
         position = predicted_raw.copy()
-        values = pixels - pixels.mean(axis=(1, 2), keepdims=True)
-        energy = np.einsum("nij,nij->n", values, values)
+        # Rows of each patch's basis: the frame's pixels, one, then the reference and its gradients, anew each time.
+        basis = np.empty((len(index), 5, pixels[0].size), dtype=np.float32)
+        basis[:, 0] = pixels.reshape(len(index), -1)
+        basis[:, 1] = 1.0
         score = np.zeros(len(index))
         active = np.arange(len(index))
         for _ in range(MAX_ITERATIONS):
             template = self._template(index[active], (centre - position)[active], ref_from_current[active])
-            step, score[active] = _step(values[active], energy[active], template)
+            step, score[active] = _step(basis, template)
             position[active] += step
             moving = (np.abs(step).max(axis=1) > CONVERGED_PX) & (
                 np.abs(position - predicted_raw)[active].max(axis=1) < 2 * MAX_WANDER_PX
@@ -104,6 +106,7 @@ class PatchTracker:
             active = active[moving]
             if not len(active):
                 break
+            basis = basis[moving]
         return position, score
 
     def _template(self, index: NDArray[np.int64], offset: Floats, ref_from_current: Floats) -> Singles:
@@ -144,31 +147,34 @@ def _cut_out(luma: Luma, corner: NDArray[np.int64], size: int) -> Singles:
     return patches
 
 
-def _step(values: Singles, energy: Singles, template: Singles) -> tuple[Floats, Floats]:
-    """Return one Gauss-Newton step (n, 2) in pixels and the correlation (n,) before it."""
-    model = template[:, 1:-1, 1:-1]
-    model = model - model.mean(axis=(1, 2), keepdims=True)
-    gu = (template[:, 1:-1, 2:] - template[:, 1:-1, :-2]) * np.float32(0.5)
-    gv = (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]) * np.float32(0.5)
-    n = len(values)
+def _step(basis: Singles, template: Singles) -> tuple[Floats, Floats]:
+    """Return one Gauss-Newton step (n, 2) in pixels and the correlation (n,) before it.
+
+    Args:
+        basis: (n, 5, pixels): the frame's pixels and one; the other three rows are filled in here.
+        template: (n, size + 2, size + 2) the reference around the same pixels.
+    """
+    n, _, size = template.shape
+    inner = size - 2
+    square = basis.reshape(n, 5, inner, inner)
+    square[:, 2] = template[:, 1:-1, 1:-1]
+    np.subtract(template[:, 1:-1, 2:], template[:, 1:-1, :-2], out=square[:, 3])
+    np.subtract(template[:, 2:, 1:-1], template[:, :-2, 1:-1], out=square[:, 4])
     # One small Gram matrix per patch holds every product that is needed.
-    basis = np.stack([model.reshape(n, -1), gu.reshape(n, -1), gv.reshape(n, -1)], axis=1)
-    ones = basis.mean(axis=2)
-    pixels = values.shape[1] * values.shape[2]
-    gram = (basis @ basis.transpose(0, 2, 1) - pixels * ones[:, :, None] * ones[:, None, :]).astype(np.float64)
-    moment = (basis @ values.reshape(n, -1, 1))[..., 0].astype(np.float64)
-    power = np.maximum(gram[:, 0, 0], 1e-9)
-    gain = moment[:, 0] / power
-    score = moment[:, 0] / np.sqrt(power * np.maximum(energy, 1e-9))
-    # Project the gain out of the gradients (variable projection), then solve the 2 x 2 system.
-    across = gram[:, 0, 1:] / power[:, None]
-    H = gram[:, 1:, 1:] - across[:, :, None] * gram[:, 0, None, 1:]
-    b = moment[:, 1:] - across * moment[:, :1]
+    gram = (basis @ basis.transpose(0, 2, 1)).astype(np.float64)
+    gram[:, :, 3:] *= 0.5
+    gram[:, 3:, :] *= 0.5
+    # An offset of the light is taken out of all of them first, then its gain out of the gradients.
+    gram = gram - gram[:, :, 1:2] * gram[:, 1:2, :] / gram[:, 1:2, 1:2]
+    energy, power, moment = np.maximum(gram[:, 0, 0], 1e-9), np.maximum(gram[:, 2, 2], 1e-9), gram[:, 0, 2]
+    score, gain = moment / np.sqrt(power * energy), moment / power
+    across = gram[:, 2, 3:] / power[:, None]
+    H = gram[:, 3:, 3:] - across[:, :, None] * gram[:, 2, None, 3:]
+    b = gram[:, 0, 3:] - across * moment[:, None]
     determinant = H[:, 0, 0] * H[:, 1, 1] - H[:, 0, 1] ** 2
     usable = (determinant > 1e-6 * (H[:, 0, 0] + H[:, 1, 1]) ** 2) & (gain > 0.1)
     safe = np.where(usable, determinant * gain, 1.0)
     du = (H[:, 1, 1] * b[:, 0] - H[:, 0, 1] * b[:, 1]) / safe
     dv = (H[:, 0, 0] * b[:, 1] - H[:, 0, 1] * b[:, 0]) / safe
-    step = -np.stack([du, dv], axis=1)
-    step = np.where(usable[:, None], np.clip(step, -2.0, 2.0), 0.0)
+    step = np.where(usable[:, None], np.clip(-np.stack([du, dv], axis=1), -2.0, 2.0), 0.0)
     return step, np.where(usable, score, 0.0)

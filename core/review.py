@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from core.bodies import world_points
 from core.camera import Pose
 from core.coordinates import Floats, apply_homography, rotation_2d
 from core.export import fitted_lines
@@ -16,7 +17,6 @@ from core.measurements import FrameMeasurement, Recording
 from core.preview import band_outline
 from core.project import LINE_NAMES, Project, Target
 from core.solution import Solution
-from core.solve_geometric import world_points
 
 # A ground feature that weighs less than this took no part in the frame's geometry.
 _USED_WEIGHT = 0.1

@@ -6,35 +6,40 @@ Everything here is relative to the local origin of the reference fit, with z = 0
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from core.bodies import RestBody, midpoints, rest_body, world_points
 from core.camera import Pose, PoseFit, fit_poses, intersect_height, plan_homographies
-from core.coordinates import Bools, Floats
+from core.coordinates import Bools, Floats, finite_median
 from core.errors import InputError
 from core.flight import SmoothFlight, smooth_flight
 from core.georeference import ReferenceFit, fit_reference, reference_pose
 from core.intervals import within
 from core.lens import Lens
 from core.measurements import Recording
-from core.motion import LineSet, RigidFit, fit_line, is_determined, rigid_from_lines, rigid_from_points
+from core.motion import RigidFit, is_determined
 from core.project import Project, Target
 from core.relief import Relief
 from core.results import Status, TargetHistory
 from core.self_calibration import Parameter, SelfCalibration, refused, self_calibrate
 from core.solution import Ground, Solution, TargetSolution, frame_status
+from core.uncertainty import SHARED_PART, Sigma, combined_sigma
 
 # Ground points a frame needs; below half of the usual number it is weak.
 LEAST_GROUND = 20
 # Stationary moments used for self-calibration, each the mean of the frames around it.
 MOMENTS = 48
+CALIBRATION_FEATURES = 150
 # Parallax below which stationary frames say nothing about the calibration, in standard deviations of a moment.
 LEAST_DRIFT_M = 0.02
 # Uncertainty of a roof's height above the ground, one standard deviation: LiDAR, and where exactly the strip lies.
 HEIGHT_SIGMA_M = 0.03
+# A moment of the stationary part is not known better than this, whatever its neighbours say.
+LEAST_NOISE_M = 2e-5
 
 
 @dataclass(frozen=True)
@@ -61,14 +66,23 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
     assert reference.pose is not None
     start = _Calibration(lens, reference.pose, heights)
     calibration = _self_calibrated(recording, project, start, reference, relief)
-    used = _corrected(start, calibration, project)
+    used = _with_correction(start, calibration.correction, project)
     ground = solve_ground(recording, used.lens, used.pose0, reference.origin_m, relief)
     flight, ground = _smoothed(recording, ground, used.lens)
+    slow_m = _calibration_sigma(recording, project, start, calibration, reference, relief)
     targets = {
-        target.name: _solve_target(recording, project, target, used, ground, reference.origin_m)
+        target.name: _solve_target(
+            recording,
+            project,
+            target,
+            used,
+            ground,
+            flight=flight,
+            slow_m=slow_m[target.name],
+            origin_m=reference.origin_m,
+        )
         for target in project.targets
     }
-    warnings = calibration.warnings if calibration is not None else ()
     return Solution(
         reference=reference,
         lens=used.lens,
@@ -78,7 +92,7 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
         histories={name: solved.history for name, solved in targets.items()},
         self_calibration=calibration,
         flight=flight,
-        warnings=warnings,
+        warnings=calibration.warnings,
     )
 
 
@@ -137,12 +151,8 @@ def _assessed(points: Floats, poses: PoseFit, focal: float) -> Ground:
 
 def _smoothed(recording: Recording, ground: Ground, lens: Lens) -> tuple[SmoothFlight | None, Ground]:
     """Smooth the camera's path and fit each frame's rotation anew about the smoothed centre."""
-    covariance = (
-        np.linalg.pinv(ground.known_poses.normal, hermitian=True) * (ground.known_poses.sigma**2)[:, None, None]
-    )
-    sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2)[:, 3:], 1e-18))
     centre = np.where(ground.usable[:, None], ground.known_poses.centre_m, np.nan)
-    flight = smooth_flight(recording.time_s, centre, np.where(ground.usable[:, None], sigma, np.nan))
+    flight = smooth_flight(recording.time_s, centre, ground.rms_px)
     if flight is None:
         return None, ground
     rays = lens.rays_from_raw(recording.ground_raw)
@@ -162,108 +172,60 @@ def _smoothed(recording: Recording, ground: Ground, lens: Lens) -> tuple[SmoothF
 # --- targets ---------------------------------------------------------------------------------------------------------
 
 
-def world_points(raw: Floats, lens: Lens, poses: PoseFit | Pose, z_m: float) -> Floats:
-    """Return local x, y (F, ..., 2) of raw pixels (F, ..., 2) on the plane z, seen from each frame's pose."""
-    rays = lens.rays_from_raw(raw)
-    flat = rays.reshape(len(rays), -1, 2)
-    return intersect_height(poses.R, poses.centre_m, flat, z_m).reshape(rays.shape)
-
-
 def _solve_target(
     recording: Recording,
     project: Project,
     target: Target,
     used: _Calibration,
     ground: Ground,
+    *,
+    flight: SmoothFlight | None,
+    slow_m: Floats,
     origin_m: Floats,
 ) -> TargetSolution:
     height = used.heights_m[target.name]
     body = rest_body(recording, target.name, used.lens, used.pose0, height)
-    points = world_points(_midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, height)
+    points = world_points(midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, height)
     still = _stationary(recording.time_s, project)
     fit = body.fit(points, still & ground.usable)
     used_points = (fit.weight > 0.1).reshape(len(fit.weight), -1).sum(axis=1)
     status = frame_status(recording, project, ground, used_points, is_determined(fit.normal))
-    apparent = world_points(_midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, 0.0)
+    apparent = world_points(midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, 0.0)
     flat = rest_body(recording, target.name, used.lens, used.pose0, 0.0)
     raw = flat.fit(apparent, np.zeros(len(apparent), dtype=bool))
     scale = _paper_scale(target, flat, used.pose0, height)
-    shift = _from_rest(np.stack([fit.at(place, body.centre) for place in body.places], 1), fit, still, status)
-    sigma = _sigma(fit, body)
+    measured = (status == Status.OK) | (status == Status.WEAK)
+    places, rotation = _from_rest(
+        np.stack([fit.at(place, body.centre) for place in body.places], 1), fit.rotation_rad, still & measured
+    )
+    part = height / used.pose0.centre_m[2]
+    pixel_m = (used.pose0.centre_m[2] - height) / float(used.lens.focal_px.mean())
+    frames = len(recording.frame)
+    sigma = combined_sigma(
+        _sigma_of_points(fit, body),
+        camera_m=np.zeros((frames, 2)) if flight is None else part * flight.sigma_m[:, :2],
+        shared_m=SHARED_PART * np.hypot(ground.rms_px * pixel_m, fit.sigma.mean(axis=1)),
+        slow_m=slow_m,
+        places_m=places,
+        rotation_rad=rotation,
+        still=still & measured,
+    )
     history = TargetHistory(
         name=target.name,
         frame=recording.frame,
         time_s=recording.time_s,
         status=status,
-        p1_m=shift[0][:, 0],
-        p2_m=shift[0][:, 1],
-        rotation_rad=shift[1],
-        p1_sigma_m=sigma[0],
-        p2_sigma_m=sigma[1],
-        rotation_sigma_rad=sigma[2],
+        p1_m=places[:, 0],
+        p2_m=places[:, 1],
+        rotation_rad=rotation,
+        p1_sigma_m=sigma.places_m[:, 0],
+        p2_sigma_m=sigma.places_m[:, 1],
+        rotation_sigma_rad=sigma.rotation_rad,
         p1_raw_m=scale * raw.at(flat.places[0], flat.centre),
         p2_raw_m=scale * raw.at(flat.places[1], flat.centre),
         rotation_raw_rad=raw.rotation_rad,
     )
     return TargetSolution(history=history, rest_m=body.places + origin_m)
-
-
-@dataclass(frozen=True)
-class RestBody:
-    """A target as it lies in the reference frame, in one plane.
-
-    Attributes:
-        lines: of a lines target, else None.
-        points: (N, 2) of a points target, else None.
-        centre: (2,) pivot.
-        places: (2, 2) P1 and P2.
-    """
-
-    lines: LineSet | None
-    points: Floats | None
-    centre: Floats
-    places: Floats
-
-    def fit(self, points: Floats, still: Bools) -> RigidFit:
-        """Return the motion of F frames from points (F, L, S, 2) or (F, N, 2).
-
-        Args:
-            still: (F,) frames from which lasting departures of a strip from a straight line are learnt.
-        """
-        weight = np.ones(points.shape[:-1])
-        if self.points is not None:
-            return rigid_from_points(points, weight, self.points, self.centre)
-        assert self.lines is not None
-        fit = rigid_from_lines(points, weight, self.lines)
-        if still.sum() < 10:
-            return fit
-        residual = fit.residual[still]
-        seen = np.isfinite(residual).sum(axis=0) >= 5
-        pattern = np.where(seen, np.nanmedian(np.where(seen, residual, 0.0), axis=0), 0.0)
-        return rigid_from_lines(points, weight, self.lines, pattern=np.nan_to_num(pattern))
-
-
-def _midpoints(raw: Floats) -> Floats:
-    """Return what carries the motion: mid-lines (F, L, S, 2) of edges (F, L, S, 2, 2), or patches as they are."""
-    return raw.mean(axis=-2) if raw.ndim == 5 else raw
-
-
-def rest_body(recording: Recording, name: str, lens: Lens, pose0: Pose, z_m: float) -> RestBody:
-    """Return a target as it lies in the reference frame, on the plane z.
-
-    P1 and P2 are L1 and L2 met by T1; of a points target, the ends of its region's longer axis.
-    """
-    raw = _midpoints(recording.reference.targets_raw[name][None])
-    places = world_points(raw, lens, Pose(pose0.R[None], pose0.centre_m[None]), z_m)[0]
-    if places.ndim == 2:
-        centre = np.nanmean(places, axis=0)
-        _, _, axes = np.linalg.svd(places - centre, full_matrices=False)
-        arm = axes[0] * np.ptp((places - centre) @ axes[0]) / 4
-        return RestBody(None, places, centre, np.stack([centre + arm, centre - arm]))
-    centre = np.nanmean(places.reshape(-1, 2), axis=0)
-    fits = [fit_line(line, np.ones(len(line)), centre) for line in places]
-    lines = LineSet(np.array([n for n, _ in fits]), np.array([o for _, o in fits]), centre)
-    return RestBody(lines, None, centre, np.stack([lines.intersection(0, 2), lines.intersection(1, 2)]))
 
 
 def _paper_scale(target: Target, flat: RestBody, pose0: Pose, height_m: float) -> float:
@@ -279,22 +241,22 @@ def _stationary(time_s: Floats, project: Project) -> Bools:
     return within(time_s, interval) if interval is not None else np.zeros(len(time_s), dtype=bool)
 
 
-def _from_rest(places: Floats, fit: RigidFit, still: Bools, status: NDArray[np.str_]) -> tuple[Floats, Floats]:
+def _from_rest(places: Floats, rotation_rad: Floats, still: Bools) -> tuple[Floats, Floats]:
     """Return displacements (F, 2, 2) and rotations (F,) from their mean in the stationary part, where there is one."""
-    good = still & ((status == Status.OK) | (status == Status.WEAK))
-    if not good.any():
-        return places, fit.rotation_rad
-    return places - places[good].mean(axis=0), fit.rotation_rad - fit.rotation_rad[good].mean()
+    if not still.any():
+        return places, rotation_rad
+    return places - places[still].mean(axis=0), rotation_rad - rotation_rad[still].mean()
 
 
-def _sigma(fit: RigidFit, body: RestBody) -> tuple[Floats, Floats, Floats]:
+def _sigma_of_points(fit: RigidFit, body: RestBody) -> Sigma:
+    """Return what the scatter of a target's own points makes of its displacement and rotation."""
     covariance = np.linalg.pinv(fit.normal, hermitian=True)
-    sigmas = []
+    places = []
     for place in body.places:
         arm = place - body.centre
         J = np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]]])
-        sigmas.append(np.sqrt(np.diagonal(J @ covariance @ J.T, axis1=1, axis2=2)))
-    return sigmas[0], sigmas[1], np.sqrt(covariance[:, 2, 2])
+        places.append(np.sqrt(np.diagonal(J @ covariance @ J.T, axis1=1, axis2=2)))
+    return Sigma(np.stack(places, axis=1), np.sqrt(covariance[:, 2, 2]))
 
 
 # --- self-calibration ------------------------------------------------------------------------------------------------
@@ -313,12 +275,6 @@ def _parameters(lens: Lens, project: Project) -> tuple[Parameter, ...]:
     )
 
 
-def _corrected(start: _Calibration, calibration: SelfCalibration | None, project: Project) -> _Calibration:
-    if calibration is None:
-        return start
-    return _with_correction(start, calibration.correction, project)
-
-
 def _with_correction(start: _Calibration, correction: Floats, project: Project) -> _Calibration:
     K, d = start.lens.camera_matrix.copy(), start.lens.distortion.copy()
     K[[0, 1, 0, 1], [0, 1, 2, 2]] += correction[:4]
@@ -333,7 +289,7 @@ def _with_correction(start: _Calibration, correction: Floats, project: Project) 
 
 def _self_calibrated(
     recording: Recording, project: Project, start: _Calibration, reference: ReferenceFit, relief: Relief | None
-) -> SelfCalibration | None:
+) -> SelfCalibration:
     parameters = _parameters(start.lens, project)
     still = _stationary(recording.time_s, project)
     if project.intervals_s.pre_event is None:
@@ -345,7 +301,17 @@ def _self_calibrated(
     drift = ground.known_poses.centre_m[ground.usable].std(axis=0)[:2] if ground.usable.any() else np.zeros(2)
     if float(np.hypot(*drift)) < LEAST_DRIFT_M:
         return refused(parameters, f"the camera drifted by {np.hypot(*drift) * 100:.1f} cm only, too little to tell")
+    apparent_motion = _apparent_motion(moments, project, start, reference, relief)
+    motion = apparent_motion(np.zeros(len(parameters)))
+    noise = 1.4826 * finite_median(np.abs(np.diff(motion, n=2, axis=0)).T) / np.sqrt(6.0)
+    sigma = np.where(np.isfinite(motion), np.maximum(noise, LEAST_NOISE_M), np.nan)
+    return self_calibrate(parameters, apparent_motion, sigma)
 
+
+def _apparent_motion(
+    moments: Recording, project: Project, start: _Calibration, reference: ReferenceFit, relief: Relief | None
+) -> Callable[[Floats], Floats]:
+    """Return a function from corrections of the calibration to P1 and P2 of every target, (moments, 4 targets)."""
     elevation = click_elevation(project, relief)
 
     def apparent_motion(correction: Floats) -> Floats:
@@ -356,20 +322,60 @@ def _self_calibrated(
         for target in project.targets:
             height = used.heights_m[target.name]
             body = rest_body(moments, target.name, used.lens, pose0, height)
-            points = world_points(_midpoints(moments.targets_raw[target.name]), used.lens, solved.known_poses, height)
+            points = world_points(midpoints(moments.targets_raw[target.name]), used.lens, solved.known_poses, height)
             fit = body.fit(points, np.zeros(len(points), dtype=bool))
             columns += [fit.at(place, body.centre) for place in body.places]
         motion = np.concatenate(columns, axis=1)
         return np.where(solved.usable[:, None], motion, np.nan)
 
-    motion = apparent_motion(np.zeros(len(parameters)))
-    noise = 1.4826 * np.nanmedian(np.abs(np.diff(motion, n=2, axis=0)), axis=0) / np.sqrt(6.0)
-    sigma = np.where(np.isfinite(motion), np.maximum(noise, 2e-5), np.nan)
-    return self_calibrate(parameters, apparent_motion, sigma)
+    return apparent_motion
+
+
+def _calibration_sigma(
+    recording: Recording,
+    project: Project,
+    start: _Calibration,
+    calibration: SelfCalibration,
+    reference: ReferenceFit,
+    relief: Relief | None,
+) -> dict[str, Floats]:
+    """Return, per target, what the uncertainty of the calibration moves P1 and P2 by from rest, (F, 2, 2) metres.
+
+    It changes as slowly as the camera drifts, so it is computed at some frames and interpolated.
+    """
+    chosen = np.unique(np.linspace(0, len(recording.frame) - 1, MOMENTS).astype(int))
+    some = _selected(_thinned(recording), chosen)
+    apparent_motion = _apparent_motion(some, project, start, reference, relief)
+    motion = apparent_motion(calibration.correction)
+    steps = 0.5 * np.array([parameter.sigma for parameter in calibration.parameters])
+    J = np.stack([(apparent_motion(calibration.correction + d) - motion) for d in np.diag(steps)], -1) / steps
+    still = _stationary(some.time_s, project) & np.isfinite(motion).all(axis=1)
+    rest = J[still].mean(axis=0) if still.any() else J[np.isfinite(motion).all(axis=1)][:1].sum(axis=0)
+    variance = np.einsum("fku,uv,fkv->fk", J - rest, calibration.covariance, J - rest)
+    known = np.isfinite(variance).all(axis=1)
+    if not known.any():
+        return {target.name: np.full((len(recording.frame), 2, 2), np.nan) for target in project.targets}
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    columns = [np.interp(recording.time_s, some.time_s[known], column[known]) for column in sigma.T]
+    every = np.stack(columns, axis=1).reshape(len(recording.frame), -1, 2, 2)
+    return {target.name: every[:, number] for number, target in enumerate(project.targets)}
+
+
+def _selected(recording: Recording, chosen: NDArray[np.int64]) -> Recording:
+    """Return a recording of some frames only."""
+    return replace(
+        recording,
+        frame=recording.frame[chosen],
+        time_s=recording.time_s[chosen],
+        H_ray_ray0=recording.H_ray_ray0[chosen],
+        ground_raw=recording.ground_raw[chosen],
+        targets_raw={name: raw[chosen] for name, raw in recording.targets_raw.items()},
+    )
 
 
 def _moments(recording: Recording, still: Bools) -> Recording:
     """Return the stationary part as at most `MOMENTS` means of neighbouring frames, each less noisy than one frame."""
+    recording = _thinned(recording)
     groups = [g for g in np.array_split(np.flatnonzero(still), MOMENTS) if len(g)]
 
     def mean(values: Floats) -> Floats:
@@ -383,6 +389,13 @@ def _moments(recording: Recording, still: Bools) -> Recording:
         ground_raw=mean(recording.ground_raw),
         targets_raw={name: mean(raw) for name, raw in recording.targets_raw.items()},
     )
+
+
+def _thinned(recording: Recording) -> Recording:
+    """Return a recording with fewer ground features: calibration shows in slow motion, which needs no more."""
+    kept = slice(None, None, max(1, recording.ground_raw.shape[1] // CALIBRATION_FEATURES))
+    reference = replace(recording.reference, ground_raw=recording.reference.ground_raw[kept])
+    return replace(recording, reference=reference, ground_raw=recording.ground_raw[:, kept])
 
 
 def _mean_seen(values: Floats) -> Floats:

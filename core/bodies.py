@@ -1,0 +1,78 @@
+"""A target as a rigid body in its own plane: where its lines or points lie at rest, and how measured ones move it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from core.camera import Pose, PoseFit, intersect_height
+from core.coordinates import Bools, Floats
+from core.lens import Lens
+from core.measurements import Recording
+from core.motion import LineSet, RigidFit, fit_line, rigid_from_lines, rigid_from_points
+
+
+def world_points(raw: Floats, lens: Lens, poses: PoseFit | Pose, z_m: float) -> Floats:
+    """Return local x, y (F, ..., 2) of raw pixels (F, ..., 2) on the plane z, seen from each frame's pose."""
+    rays = lens.rays_from_raw(raw)
+    flat = rays.reshape(len(rays), -1, 2)
+    return intersect_height(poses.R, poses.centre_m, flat, z_m).reshape(rays.shape)
+
+
+@dataclass(frozen=True)
+class RestBody:
+    """A target as it lies in the reference frame, in one plane.
+
+    Attributes:
+        lines: of a lines target, else None.
+        points: (N, 2) of a points target, else None.
+        centre: (2,) pivot.
+        places: (2, 2) P1 and P2.
+    """
+
+    lines: LineSet | None
+    points: Floats | None
+    centre: Floats
+    places: Floats
+
+    def fit(self, points: Floats, still: Bools) -> RigidFit:
+        """Return the motion of F frames from points (F, L, S, 2) or (F, N, 2).
+
+        Args:
+            still: (F,) frames from which lasting departures of a strip from a straight line are learnt.
+        """
+        weight = np.ones(points.shape[:-1])
+        if self.points is not None:
+            return rigid_from_points(points, weight, self.points, self.centre)
+        assert self.lines is not None
+        fit = rigid_from_lines(points, weight, self.lines)
+        if still.sum() < 10:
+            return fit
+        residual = fit.residual[still]
+        seen = np.isfinite(residual).sum(axis=0) >= 5
+        pattern = np.where(seen, np.nanmedian(np.where(seen, residual, 0.0), axis=0), 0.0)
+        return rigid_from_lines(points, weight, self.lines, pattern=np.nan_to_num(pattern))
+
+
+def midpoints(raw: Floats) -> Floats:
+    """Return what carries the motion: mid-lines (F, L, S, 2) of edges (F, L, S, 2, 2), or patches as they are."""
+    return raw.mean(axis=-2) if raw.ndim == 5 else raw
+
+
+def rest_body(recording: Recording, name: str, lens: Lens, pose0: Pose, z_m: float) -> RestBody:
+    """Return a target as it lies in the reference frame, on the plane z.
+
+    P1 and P2 are L1 and L2 met by T1; of a points target, the ends of its region's longer axis.
+    """
+    raw = midpoints(recording.reference.targets_raw[name][None])
+    places = world_points(raw, lens, Pose(pose0.R[None], pose0.centre_m[None]), z_m)[0]
+    if places.ndim == 2:
+        centre = np.nanmean(places, axis=0)
+        _, _, axes = np.linalg.svd(places - centre, full_matrices=False)
+        arm = axes[0] * np.ptp((places - centre) @ axes[0]) / 4
+        return RestBody(None, places, centre, np.stack([centre + arm, centre - arm]))
+    centre = np.nanmean(places.reshape(-1, 2), axis=0)
+    fits = [fit_line(line, np.ones(len(line)), centre) for line in places]
+    lines = LineSet(np.array([n for n, _ in fits]), np.array([o for _, o in fits]), centre)
+    return RestBody(lines, None, centre, np.stack([lines.intersection(0, 2), lines.intersection(1, 2)]))
