@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,7 +58,8 @@ def zoomed(page: Page, pane: Locator, size: tuple[int, int], image: Floats, whee
 
 def drawn(page: Page, pane: Locator, scale: float) -> None:
     """Wait until a pane says that it shows its picture at a scale, and has drawn it so."""
-    expect(pane.locator(".pane-readout")).to_contain_text(f"{100 * scale:.{1 if scale < 0.1 else 0}f} %")
+    percent = int(100 * scale)  # told rounded, up or down
+    expect(pane.locator(".pane-readout")).to_contain_text(re.compile(rf"\b({percent}|{percent + 1})(\.\d)? %"))
     page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 

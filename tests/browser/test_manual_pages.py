@@ -50,8 +50,7 @@ def project(server, request):
     folder = workspace / name
     folder.mkdir()
     document = json.loads((SAMPLE / "project.json").read_text())
-    files = {"video": "video.mp4", "cloud": "site.laz", "lens": "lens.yaml"}
-    document["inputs"] = {kind: f"../footage/{file}" for kind, file in files.items()} | {"gps": None}
+    document["inputs"] = {"video": "../footage/video.mp4", "lens": "../footage/lens.yaml"}  # no cloud: nothing to read
     (folder / "project.json").write_text(json.dumps(document))
     return folder, f"{address}/p/{name}"
 
@@ -421,7 +420,8 @@ def test_an_upload_that_is_cancelled_leaves_nothing(browser, project, tmp_path):
 def test_a_clicked_height_and_a_region_make_a_target_of_points(browser, project, truth):
     folder, pages = project
     document = json.loads((folder / "project.json").read_text())
-    (folder / "project.json").write_text(json.dumps(document | {"targets": []}))
+    inputs = document["inputs"] | {"cloud": "../footage/site.laz"}
+    (folder / "project.json").write_text(json.dumps(document | {"inputs": inputs, "targets": []}))
     roof = document["targets"][0]["lines"]
     with watched(browser, pages) as page:
         page.goto(f"{pages}/orthoimage?view=picture")
