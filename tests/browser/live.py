@@ -66,7 +66,7 @@ def watched(browser: Browser, address: str, **options: Any) -> Iterator[Page]:
     """Yield a page that must neither throw, nor be answered an internal error, nor ask any other computer."""
     troubles: list[str] = []
     context: BrowserContext = browser.new_context(**{"viewport": {"width": 1440, "height": 900}, **options})
-    context.set_default_timeout(20_000)
+    context.set_default_timeout(45_000)
     page = context.new_page()
     page.on("pageerror", lambda error: troubles.append(f"threw {error}"))
     page.on("request", lambda request: _note_outside(request.url, address, troubles))

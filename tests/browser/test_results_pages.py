@@ -98,11 +98,10 @@ def test_the_overlay_lies_where_the_engine_measured(browser, finished, ratio):
         to_canvas = whole_picture(box)
         marks_agree(page, measured["targets"]["roof"], to_canvas)
         features_agree(page, np.array(measured["ground"]["used"]), to_canvas, ratio)
-        at = np.array([0.3 * box["width"], 0.2 * box["height"]])
-        page.mouse.move(box["x"] + at[0], box["y"] + at[1])
-        page.mouse.wheel(0, -500)
-        page.mouse.move(box["x"] + box["width"] - 30, box["y"] + 30)
-        closer = zoomed(to_canvas, at, np.exp(500 * 0.0016))
+        page.locator(".review-frame").focus()
+        for key in ["+"] * 2 + ["ArrowLeft"] * 8 + ["ArrowUp"] * 4:
+            page.keyboard.press(key)
+        closer = zoomed(to_canvas, np.array([box["width"], box["height"]]) / 2, 1.4**2, [8 * 40, 4 * 40])
         page.wait_for_function(MARK_IS_NEAR, arg=closer(measured["targets"]["roof"]["p1_raw"]).tolist())
         marks_agree(page, measured["targets"]["roof"], closer)
         features_agree(page, np.array(measured["ground"]["used"]), closer, ratio)
@@ -121,8 +120,8 @@ def whole_picture(box):
     return lambda raw: scale * (np.asarray(raw, dtype=float) + 0.5 - video / 2) + size / 2
 
 
-def zoomed(to_canvas, at, factor):
-    return lambda raw: at + factor * (to_canvas(raw) - at)
+def zoomed(to_canvas, middle, factor, panned):
+    return lambda raw: middle + factor * (to_canvas(raw) - middle) + panned
 
 
 def marks_agree(page: Page, roof, to_canvas):
