@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
@@ -72,27 +72,38 @@ def _bytes(values: Image) -> Bytes:
 
 def write_video(scene: Scene, file: Path, watch: Watcher = lambda done, total: None, threads: int = 2) -> None:
     """Render and encode the whole clip."""
-    recording = scene.recording
-    times = scene.frame_times()
-    width, height = scene.lens.image_size_px
-    stored = (height, width) if recording.turned else (width, height)
+    encode(_ahead(frames(scene)), scene.frame_times(), scene.recording, file, watch=watch, threads=threads)
+
+
+def encode(
+    images: Iterable[Bytes],
+    times_s: NDArray[np.float64],
+    recording: Recording,
+    file: Path,
+    *,
+    watch: Watcher = lambda done, total: None,
+    threads: int = 2,
+) -> None:
+    """Write upright 4:2:0 images, one for each time, as a video."""
+    rate = Fraction(recording.rate_hz).limit_denominator(1001)
     with av.open(str(file), "w") as container:
-        rate = Fraction(recording.rate_hz).limit_denominator(1001)
         stream = cast(
             av.VideoStream, container.add_stream(recording.codec, rate=rate, options=_encoder_options(recording))
         )
-        stream.width, stream.height = stored
         stream.pix_fmt = "yuv420p"
         stream.bit_rate = recording.bit_rate
         stream.time_base = Fraction(1, TIME_BASE_HZ)
         stream.codec_context.time_base = Fraction(1, TIME_BASE_HZ)
         stream.codec_context.thread_count = threads
-        for number, (time_s, image) in enumerate(zip(times, _ahead(frames(scene)), strict=True)):
-            frame = av.VideoFrame.from_ndarray(_on_its_side(image) if recording.turned else image, format="yuv420p")
+        for number, (time_s, upright) in enumerate(zip(times_s, images, strict=True)):
+            image = _on_its_side(upright) if recording.turned else upright
+            if number == 0:
+                stream.width, stream.height = image.shape[1], image.shape[0] * 2 // 3
+            frame = av.VideoFrame.from_ndarray(image, format="yuv420p")
             frame.pts = round(time_s * TIME_BASE_HZ)
             frame.time_base = Fraction(1, TIME_BASE_HZ)
             container.mux(stream.encode(frame))
-            watch(number + 1, len(times))
+            watch(number + 1, len(times_s))
         container.mux(stream.encode(None))
     if recording.turned:
         _set_rotation_flag(file)
