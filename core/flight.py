@@ -26,14 +26,18 @@ CUTOFFS_HZ = (0.4, 0.5, 0.65, 0.8, 1.0, 1.3, 1.7, 2.3, 3.2)
 KNOTS_PER_PERIOD = 4.0
 # Length of the runs left out, seconds, and the share of the record left out at a time.
 RUN_S = 0.25
-FOLDS = 3
+FOLDS = 4
 # The choice is made on at most so many frames, from the middle of the record.
 MOST_FRAMES = 1500
 # Beyond this many standard deviations of its frame, a pose is trusted less instead of followed.
 OUTLYING = 3.5
 LEAST_FRAMES = 24
+# Least misfit of a frame, as part of the usual one: that the reference frame fits itself says nothing about its pose.
+LEAST_MISFIT = 0.5
 # A pose's error grows with the misfit of its points, and faster where their errors are alike; more is not credible.
 MOST_GROWTH = 3.0
+# Weight of the mean position against all else: moves no frame by a nanometre, but keeps the equations soluble.
+RIDGE = 1e-11
 # No pose is better than a micrometre; the equations of a record without any noise could not be solved.
 LEAST_NOISE_M = 1e-6
 
@@ -86,7 +90,7 @@ def smooth_flight(time_s: Floats, centre_m: Floats, misfit_px: Floats) -> Smooth
     if seen.sum() < LEAST_FRAMES:
         return None
     moments, centre = time_s[seen], centre_m[seen]
-    relative = misfit_px[seen] / float(np.median(misfit_px[seen]))
+    relative = np.maximum(misfit_px[seen] / float(np.median(misfit_px[seen])), LEAST_MISFIT)
     size = relative / np.sqrt((relative**2).mean())
     cutoff_hz = choose_cutoff(moments, centre, size)
     spline = _Spline(moments, moments, cutoff_hz)
@@ -111,6 +115,7 @@ def choose_cutoff(time_s: Floats, value_m: Floats, size: Floats) -> float:
     part = slice(max(0, middle - half), middle + half)
     t, x, size = time_s[part], value_m[part], size[part]
     errors = np.array([_prediction_errors(_Spline(t, t, cutoff), t, x, size) for cutoff in CUTOFFS_HZ])
+    errors = errors + LEAST_NOISE_M**2
     return CUTOFFS_HZ[int(np.argmin((errors / errors.min(axis=0)).sum(axis=1)))]
 
 
@@ -197,6 +202,8 @@ class _Spline:
         for offset, diagonal in zip(normal.offsets, normal.data, strict=True):
             if 0 <= offset <= DEGREE:
                 banded[DEGREE - offset, : len(diagonal)] += diagonal  # shorter where the last frames were not seen
+        # Where the camera was lost for long, the penalty alone leaves more freedom than rounding can bear.
+        banded[DEGREE] += RIDGE * banded[DEGREE].max()
         return banded
 
     def kept(self, factor: Floats) -> Floats:

@@ -33,7 +33,7 @@ from core.uncertainty import SHARED_PART, Sigma, combined_sigma
 LEAST_GROUND = 20
 # Stationary moments used for self-calibration, each the mean of the frames around it.
 MOMENTS = 48
-CALIBRATION_FEATURES = 150
+CALIBRATION_FEATURES = 230
 # Parallax below which stationary frames say nothing about the calibration, in standard deviations of a moment.
 LEAST_DRIFT_M = 0.02
 # Uncertainty of a roof's height above the ground, one standard deviation: LiDAR, and where exactly the strip lies.

@@ -39,11 +39,13 @@ ORDER = (
     "validation",
     "results",
     "measurements",
+    "bodies",
     "prediction",
     "paper",
     "cluster",
     "measure",
     "preview",
+    "uncertainty",
     "solution",
     "solve_geometric",
     "solve_paper",
@@ -60,6 +62,7 @@ ORDER = (
 STEPS = {"georeference", "ground", "roof_lines", "motion", "flight", "drift", "validation"}
 CONDUCTORS = {
     "following",
+    "bodies",
     "paper",
     "measure",
     "preview",
