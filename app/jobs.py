@@ -36,7 +36,8 @@ _RESUMED = "track"
 _EVENTS_PER_S = 5.0
 _RATE_WINDOW_S = 6.0
 _JOBS_KEPT = 200
-_PATIENCE_S = 20.0
+# A worker that is in a step which cannot be left is killed after this time; the engine is made so that it may be.
+_PATIENCE_S = 6.0
 
 log = logging.getLogger("rooftrack")
 
@@ -58,6 +59,8 @@ class Job:
     message: str = ""
     result: Any = None
     started_s: float = field(default_factory=time.time)
+    asked_to_stop: bool = False
+    stopped_with_server: bool = False
     _marks: deque[tuple[float, int]] = field(default_factory=deque)
     _told_s: float = 0.0
 
@@ -115,7 +118,6 @@ class Jobs:
         self._processes: dict[str, subprocess.Popen[str]] = {}
         self._watchers: dict[str, threading.Thread] = {}
         self._lock = threading.RLock()
-        self._closing = False
 
     def start(
         self, project: ProjectFolder, kind: str, parameters: dict[str, Any] | None = None, finish: Finish | None = None
@@ -176,28 +178,32 @@ class Jobs:
     def cancel(self, job: Job) -> None:
         """Ask a job to stop; the answer comes when it has."""
         process = self._processes.get(job.id)
-        if job.state in ACTIVE and process is not None:
+        if job.state in ACTIVE and process is not None and not job.asked_to_stop:
+            job.asked_to_stop = True
             job.message = "Stopping after the frame it is in."
             _send(process, "cancel")
+            impatience = threading.Timer(_PATIENCE_S, process.kill)
+            impatience.daemon = True
+            impatience.start()
             self._tell(job)
 
-    def cancel_all(self, project_id: str, *, wait_s: float = _PATIENCE_S) -> None:
+    def cancel_all(self, project_id: str) -> None:
         """Stop every job of a project and wait until none of them writes any more."""
         for job in [job for job in list(self._jobs.values()) if job.project == project_id and job.state in ACTIVE]:
             self.cancel(job)
-            self._await_end(job, wait_s)
+            self._await_end(job)
 
     def close(self) -> None:
         """Stop every job because the server stops; tracking will go on when it is back."""
-        self._closing = True
         active = [job for job in list(self._jobs.values()) if job.state in ACTIVE]
         for job in active:
             process = self._processes.get(job.id)
             if job.kind == _BESIDE and process is not None:
                 process.kill()  # it has nothing to lose
+            job.stopped_with_server = not job.asked_to_stop
             self.cancel(job)
         for job in active:
-            self._await_end(job, _PATIENCE_S)
+            self._await_end(job)
 
     def go_on(self, workspace: Workspace, finishes: dict[str, Finish]) -> list[tuple[ProjectFolder, Job]]:
         """Go on with the tracking that ran when the last server of this workspace stopped; return what was started."""
@@ -213,14 +219,10 @@ class Jobs:
                 (project.results / JOB_FILE).unlink(missing_ok=True)
         return started
 
-    def _await_end(self, job: Job, wait_s: float) -> None:
-        watcher, process = self._watchers.get(job.id), self._processes.get(job.id)
-        if watcher is None:
-            return
-        watcher.join(wait_s)
-        if watcher.is_alive() and process is not None:
-            process.kill()
-            watcher.join(5.0)
+    def _await_end(self, job: Job) -> None:
+        watcher = self._watchers.get(job.id)
+        if watcher is not None:
+            watcher.join(2.0 * _PATIENCE_S)
 
     def _watch(self, project: ProjectFolder, job: Job, process: subprocess.Popen[str], finish: Finish | None) -> None:
         assert process.stdout is not None
@@ -230,14 +232,14 @@ class Jobs:
         drain.start()
         end: dict[str, Any] | None = None
         for line in process.stdout:
-            report = json.loads(line)
+            report = _report_in(line)
             if "event" in report:
                 self._hub.publish(job.project, report["event"], report["data"])
             elif "stage" in report:
                 job.advance(report["stage"], report["done"], report["total"])
                 if job.may_tell():
                     self._tell(job)
-            else:
+            elif report:
                 end = report
         process.wait()
         drain.join(2.0)
@@ -250,7 +252,9 @@ class Jobs:
         self, project: ProjectFolder, job: Job, end: dict[str, Any] | None, finish: Finish | None, complaints: str
     ) -> None:
         try:
-            if end is None:
+            if end is None and job.asked_to_stop:
+                end = {"cancelled": True}
+            elif end is None:
                 log.error("job %s of %s ended without a word:\n%s", job.kind, job.project, complaints)
                 raise InputError(f"{_spoken(job.kind)} broke off unexpectedly; start it again to go on from there.")
             if "failed" in end:
@@ -259,7 +263,7 @@ class Jobs:
                 log.error("job %s of %s failed:\n%s", job.kind, job.project, end["traceback"])
                 raise InputError(end["broken"])
             if "cancelled" in end:
-                state: State = "interrupted" if self._closing else "cancelled"
+                state: State = "interrupted" if job.stopped_with_server else "cancelled"
                 message = "Stopped; what was measured is kept."
             else:
                 job.result = finish(project, end["done"]) if finish else end["done"]
@@ -289,6 +293,15 @@ class Jobs:
         over = [job.id for job in self._jobs.values() if job.state not in ACTIVE][: len(self._jobs) - _JOBS_KEPT]
         for job_id in over if len(self._jobs) > _JOBS_KEPT else ():
             del self._jobs[job_id]
+
+
+def _report_in(line: str) -> dict[str, Any]:
+    """Return the report in a line; nothing where the worker was killed in the middle of it."""
+    try:
+        report: dict[str, Any] = json.loads(line)
+    except ValueError:
+        return {}
+    return report
 
 
 def _spoken(kind: str) -> str:
