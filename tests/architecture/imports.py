@@ -61,6 +61,7 @@ ORDER = (
 # Steps of the measurement: others may know what they return, only conductors call them.
 STEPS = {"georeference", "ground", "roof_lines", "motion", "flight", "drift", "validation"}
 CONDUCTORS = {
+    "bodies",
     "following",
     "bodies",
     "paper",
