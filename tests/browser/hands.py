@@ -59,7 +59,7 @@ def zoomed(page: Page, pane: Locator, size: tuple[int, int], image: Floats, whee
 def drawn(page: Page, pane: Locator, scale: float) -> None:
     """Wait until a pane says that it shows its picture at a scale, and has drawn it so."""
     percent = int(100 * scale)  # told rounded, up or down
-    expect(pane.locator(".pane-readout")).to_contain_text(re.compile(rf"\b({percent}|{percent + 1})(\.\d)? %"))
+    expect(pane.locator(".pane-readout")).to_contain_text(re.compile(rf"(?<!\d)({percent}|{percent + 1})(\.\d)? %"))
     page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 

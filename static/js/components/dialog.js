@@ -5,6 +5,8 @@ import { icon } from "../lib/icons.js";
 
 /** @typedef {import("../lib/dom.js").Child} Child */
 
+let opened = 0;
+
 /**
  * Open a dialog. The promise resolves when it is closed, with what `close` was given (null for Escape or Cancel).
  * @template Result
@@ -16,14 +18,15 @@ import { icon } from "../lib/icons.js";
  */
 export function openDialog({ title, body, size = "" }) {
   return new Promise((resolve) => {
-    const dialog = h("dialog", { class: `dialog ${size}`, "aria-labelledby": "dialog-title" });
+    const titleId = `dialog-title-${(opened += 1)}`;
+    const dialog = h("dialog", { class: `dialog ${size}`, "aria-labelledby": titleId });
     const close = (/** @type {Result | null} */ result) => {
       dialog.close();
       dialog.remove();
       resolve(result);
     };
     const dismiss = h("button", { class: "button quiet icon-only", type: "button", "aria-label": "Close", onclick: () => close(null) }, icon("close"));
-    dialog.append(h("header", {}, h("h2", { id: "dialog-title" }, title), dismiss), ...body(close).filter((child) => child instanceof Node));
+    dialog.append(h("header", {}, h("h2", { id: titleId }, title), dismiss), ...body(close).filter((child) => child instanceof Node));
     dialog.addEventListener("cancel", (event) => (event.preventDefault(), close(null)));
     dialog.addEventListener("pointerdown", (event) => event.target === dialog && close(null));
     document.body.append(dialog);

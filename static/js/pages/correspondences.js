@@ -379,7 +379,10 @@ store.on("change", ({ project, previous, origin }) => {
     void loadFrame();
   }
   if (origin === "edit" || JSON.stringify(project.correspondences) !== JSON.stringify(previous.correspondences)) askFit(project.correspondences);
-  if (origin === "saved") compare.refresh();
+  if (origin === "saved") {
+    compare.refresh();
+    void findGhosts();
+  }
   if (project.correspondences.length > previous.correspondences.length) announce(`${plural(project.correspondences.length, "pair")} placed`);
 });
 page.events.on("orthoimage", () => void loadOrtho());

@@ -157,9 +157,12 @@ const askPreview = latest(
   },
 );
 
+/** Whether there is anything of a target to look for: a band, or a closed region. @param {OpenTarget} target */
+const hasDrawing = (target) => (target.kind === "lines" ? Object.keys(target.lines ?? {}).length > 0 : isComplete(target));
+
 /** @param {OpenTarget | null} [target] as it stands while dragging */
 function refreshPreview(target = targets.selected) {
-  if (target !== null && isComplete(target) && planPane.image !== null) return askPreview(target);
+  if (target !== null && hasDrawing(target) && planPane.image !== null) return askPreview(target);
   preview = null;
   draw();
 }
