@@ -33,7 +33,7 @@ MOST_FRAMES = 1500
 OUTLYING = 3.5
 LEAST_FRAMES = 24
 # Least misfit of a frame, as part of the usual one: that the reference frame fits itself says nothing about its pose.
-LEAST_MISFIT = 0.5
+LEAST_MISFIT = 0.6
 # A pose's error grows with the misfit of its points, and faster where their errors are alike; more is not credible.
 MOST_GROWTH = 3.0
 # Weight of the mean position against all else: moves no frame by a nanometre, but keeps the equations soluble.

@@ -4,31 +4,29 @@ import numpy as np
 import pytest
 
 from core.coordinates import Floats
-from core.flight import LEAST_FRAMES, SmoothFlight, estimate_flight, smooth_flight
+from core.flight import CUTOFFS_HZ, LEAST_FRAMES, SmoothFlight, choose_cutoff, smooth_flight
 
 RATE_HZ = 30.0
 TIME_S = np.arange(900) / RATE_HZ
 
 
-def pushed(jerk: float, seed: int, count: int = 900) -> Floats:
-    """A body pushed by white jerk of a root spectral density, m s^-2.5, integrated in small steps from rest."""
-    fine = 8
+def swaying(cutoff_hz: float, seed: int, count: int = 900, size_m: float = 0.1) -> Floats:
+    """A random path that holds nothing above a frequency: the sway of a heavy body."""
     random = np.random.default_rng(seed)
-    step_s = 1 / (RATE_HZ * fine)
-    path = random.normal(scale=jerk / np.sqrt(step_s), size=count * fine)
-    for _ in range(3):
-        path = np.cumsum(path) * step_s
-    return path[::fine]
+    frequency = np.linspace(0.02, cutoff_hz, 12)
+    amplitude = random.normal(size=12) / (1 + (frequency / 0.15) ** 2)
+    time_s = np.arange(count) / RATE_HZ
+    waves = amplitude * np.sin(2 * np.pi * time_s[:, None] * frequency + random.uniform(0, 2 * np.pi, 12))
+    return size_m * waves.sum(axis=1)
 
 
-def noisy(path: Floats, noise_m: float, seed: int = 1) -> Floats:
-    return path + np.random.default_rng(seed).normal(scale=noise_m, size=path.shape)
+def noisy(path: Floats, noise_m: float | Floats, seed: int = 1) -> Floats:
+    return path + np.random.default_rng(seed).normal(scale=1.0, size=path.shape) * noise_m
 
 
-def smoothed(value: Floats, time_s: Floats = TIME_S, sigma: Floats | None = None) -> SmoothFlight:
+def smoothed(value: Floats, time_s: Floats = TIME_S, misfit_px: Floats | None = None) -> SmoothFlight:
     columns = value if value.ndim == 2 else value[:, None]
-    sizes = np.ones_like(columns) if sigma is None else sigma
-    flight = smooth_flight(time_s, columns, sizes)
+    flight = smooth_flight(time_s, columns, np.full(len(columns), 0.1) if misfit_px is None else misfit_px)
     assert flight is not None
     return flight
 
@@ -36,63 +34,64 @@ def smoothed(value: Floats, time_s: Floats = TIME_S, sigma: Floats | None = None
 # --- what the record tells of itself ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("jerk", "noise_m"), [(0.02, 1e-3), (0.02, 1e-4), (0.3, 2e-3), (0.001, 5e-3)])
-def test_noise_and_push_are_told_apart(jerk: float, noise_m: float) -> None:
-    models = [estimate_flight(TIME_S, noisy(pushed(jerk, seed), noise_m, seed + 50)) for seed in range(4)]
-    # 450 bins of a periodogram tell a density to 5 % and its root to 2.5 %; that the noise could be coloured widens it.
-    assert np.median([model.noise_m for model in models]) == pytest.approx(noise_m, rel=0.25)
+@pytest.mark.parametrize("noise_m", [1e-4, 1e-3, 5e-3])
+def test_noise_of_a_frame_is_learnt(noise_m: float) -> None:
+    flight = smoothed(noisy(swaying(0.3, 2), noise_m))
+    # 900 frames tell a standard deviation to 2.4 %; clipping at 3.5 of them and the few the path takes cost a little.
+    assert flight.models[0].noise_m == pytest.approx(noise_m, rel=0.1)
+    assert flight.models[0].memory < 0.15
 
 
-def test_how_steeply_a_path_falls_is_told() -> None:
-    calm = estimate_flight(TIME_S, noisy(0.1 * np.sin(0.7 * TIME_S) + 0.05 * np.cos(0.3 * TIME_S), 1e-3))
-    # A velocity that wanders at random: the second derivative is white.
-    wandering = 1e-4 * np.cumsum(np.cumsum(np.random.default_rng(3).normal(size=900)))
-    assert estimate_flight(TIME_S, noisy(wandering, 1e-4)).order == 2
-    assert calm.order > 2
+def test_gusts_are_followed_and_calm_is_not_mistaken_for_gusts() -> None:
+    gusty = noisy(swaying(1.5, 3) + 0.02 * np.sin(2 * np.pi * 1.2 * TIME_S), 1e-4)[:, None]
+    calm = noisy(swaying(0.2, 3), 2e-3)[:, None]
+    size = np.ones(900)
+    assert choose_cutoff(TIME_S, gusty, size) >= 1.3
+    assert choose_cutoff(TIME_S, calm, size) <= 0.8
 
 
-def test_noise_alike_in_neighbouring_frames_counts_by_what_it_does_to_slow_motion() -> None:
-    random, memory = np.random.default_rng(3), 0.6
-    noise = np.zeros(2400)
+def test_noise_alike_in_neighbouring_frames_is_told() -> None:
+    random, noise = np.random.default_rng(3), np.zeros(2400)
     for frame in range(1, 2400):
-        noise[frame] = memory * noise[frame - 1] + 1e-3 * random.normal()
-    time_s = np.arange(2400) / RATE_HZ
-    model = estimate_flight(time_s, 0.2 * np.sin(0.4 * time_s) + noise)
-    assert model.fastest_hz < 1.0
-    # An autoregression sums up to its innovations over one less its memory.
-    assert model.noise_m == pytest.approx(1e-3 / (1 - memory), rel=0.25)
+        noise[frame] = 0.5 * noise[frame - 1] + 1e-3 * random.normal()
+    flight = smoothed(swaying(0.3, 4, 2400) + noise, np.arange(2400) / RATE_HZ)
+    # The path takes up the slow part of such noise, so that what is left remembers a little less.
+    assert 0.3 < flight.models[0].memory < 0.6
+    assert flight.models[0].noise_m == pytest.approx(1e-3 / np.sqrt(1 - 0.25), rel=0.15)
 
 
-def test_one_wild_pose_does_not_decide() -> None:
-    value = noisy(pushed(0.02, 4), 1e-3)
-    wild = value.copy()
-    wild[300] += 5.0
-    assert estimate_flight(TIME_S, wild).noise_m == pytest.approx(estimate_flight(TIME_S, value).noise_m, rel=0.15)
+def test_frames_that_fit_badly_count_less() -> None:
+    path = swaying(0.3, 5)
+    misfit = np.where(np.arange(900) // 15 % 2, 0.1, 0.5)
+    value = noisy(path, 1e-3 * misfit / 0.1)
+    told, untold = smoothed(value, misfit_px=misfit).value_m[:, 0], smoothed(value).value_m[:, 0]
+    assert np.std(told - path) < 0.8 * np.std(untold - path)
 
 
 # --- the smoothed path -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("jerk", "noise_m"), [(0.02, 2e-3), (0.002, 2e-3), (0.3, 1e-3)])
-def test_smoothing_takes_out_noise_and_knows_how_much_is_left(jerk: float, noise_m: float) -> None:
+@pytest.mark.parametrize(("cutoff_hz", "noise_m"), [(0.3, 2e-3), (0.3, 2e-4), (0.8, 1e-3)])
+def test_smoothing_takes_out_noise_and_knows_how_much_is_left(cutoff_hz: float, noise_m: float) -> None:
     ratios, gains = [], []
-    for seed in range(4):
-        path = pushed(jerk, seed)
+    for seed in range(6):
+        path = swaying(cutoff_hz, seed)
         flight = smoothed(noisy(path, noise_m, seed + 50))
         error = flight.value_m[:, 0] - path
         gains.append(np.sqrt(np.mean(error**2)) / noise_m)
         ratios.append(np.mean((error / flight.sigma_m[:, 0]) ** 2))
-    assert max(gains) < 0.6
+    # Of 30 frames a second, those of about half a period are averaged.
+    assert np.mean(gains) < 0.6
     # Errors stay alike for a second, so that a record holds only some dozens of independent ones.
     assert 0.5 < np.mean(ratios) < 2.0
 
 
-def test_three_coordinates_are_smoothed_each_by_its_own() -> None:
-    paths = np.stack([pushed(0.02, 1), pushed(0.005, 2), np.full(900, 40.0)], axis=1)
-    flight = smoothed(paths + np.random.default_rng(3).normal(scale=[1e-3, 2e-3, 5e-4], size=(900, 3)))
+def test_three_coordinates_move_as_one_body_but_err_each_by_its_own() -> None:
+    paths = np.stack([swaying(0.3, 1), swaying(0.3, 2), np.full(900, 40.0)], axis=1)
+    flight = smoothed(noisy(paths, np.array([1e-3, 2e-3, 5e-4])))
     assert flight.value_m.shape == flight.sigma_m.shape == (900, 3)
-    noises = [model.noise_m for model in flight.models]
-    np.testing.assert_allclose(noises, [1e-3, 2e-3, 5e-4], rtol=0.3)
+    np.testing.assert_allclose(flight.noise_m, [1e-3, 2e-3, 5e-4], rtol=0.15)
+    assert len({model.cutoff_hz for model in flight.models}) == 1
     assert (np.abs(flight.value_m - paths).max(axis=0) < 3 * np.array([1e-3, 2e-3, 5e-4])).all()
 
 
@@ -106,63 +105,59 @@ def test_smooth_flight_without_noise_passes_as_it_is() -> None:
     np.testing.assert_allclose(smoothed(path).value_m[:, 0], path, atol=5e-6)
 
 
+def test_a_camera_on_a_tripod() -> None:
+    for seed in range(3):
+        for count in (LEAST_FRAMES, 100, 900):
+            flight = smoothed(noisy(np.full(count, 40.0), 1e-3, seed), TIME_S[:count])
+            # A quintic through 24 frames keeps six parts of 24 of the variance, 0.5 of the deviation.
+            assert np.std(flight.value_m) < 0.8e-3
+
+
+# --- frames that are missing or wrong --------------------------------------------------------------------------------
+
+
 def test_gaps_are_crossed_and_said_to_be_less_certain() -> None:
-    path, value = pushed(0.02, 5), noisy(pushed(0.02, 5), 1e-3)
+    path, value = swaying(0.3, 5), noisy(swaying(0.3, 5), 1e-3)
     value[400:430] = np.nan
     flight = smoothed(value)
     assert np.isfinite(flight.value_m).all()
     assert np.isfinite(flight.sigma_m).all()
-    assert flight.sigma_m[415, 0] > 2 * flight.sigma_m[200, 0]
+    assert flight.sigma_m[415, 0] > 1.5 * flight.sigma_m[200, 0]
     assert abs(flight.value_m[415, 0] - path[415]) < 5 * flight.sigma_m[415, 0]
 
 
-@pytest.mark.parametrize("lost", [slice(0, 90), slice(800, 900), slice(300, 600)])
+@pytest.mark.parametrize("lost", [slice(0, 90), slice(800, 900), slice(300, 600), slice(100, 850)])
 def test_a_camera_lost_at_either_end_or_for_long(lost: slice) -> None:
-    value = noisy(pushed(0.02, 5), 1e-3)
+    path, value = swaying(0.3, 6), noisy(swaying(0.3, 6), 1e-3)
     value[lost] = np.nan
     flight = smoothed(value)
     seen = np.isfinite(value)
     assert np.isfinite(flight.value_m).all()
-    assert np.abs(flight.value_m[seen, 0] - pushed(0.02, 5)[seen]).max() < 3e-3
-
-
-def test_a_camera_on_a_tripod() -> None:
-    for seed in range(6):
-        for count in (LEAST_FRAMES, 100, 900):  # a record of 24 frames still holds a parabola
-            value = noisy(np.full(count, 40.0), 1e-3, seed)
-            flight = smoothed(value, TIME_S[:count])
-            assert np.std(flight.value_m) < 0.8e-3
+    assert np.abs(flight.value_m[seen, 0] - path[seen]).max() < 4e-3
 
 
 def test_wild_poses_are_not_followed() -> None:
-    path, value = pushed(0.02, 6), noisy(pushed(0.02, 6), 1e-3)
+    path, value = swaying(0.3, 7), noisy(swaying(0.3, 7), 1e-3)
     clean = smoothed(value).value_m[:, 0]
     value[[200, 500, 501]] += [0.5, -0.3, -0.3]
     found = smoothed(value).value_m[:, 0]
-    assert np.abs(found - clean).max() < 3e-3
-    assert np.abs(found - path).max() < 5e-3
-
-
-def test_frames_known_better_count_more() -> None:
-    path = pushed(0.02, 7)
-    sigma = np.where(np.arange(900) % 2, 1.0, 6.0)[:, None]
-    value = path + np.random.default_rng(8).normal(size=900) * 1e-3 * sigma[:, 0]
-    told, untold = smoothed(value, sigma=sigma).value_m[:, 0], smoothed(value).value_m[:, 0]
-    assert np.std(told - path) < 0.7 * np.std(untold - path)
+    assert np.abs(found - clean).max() < 2e-3
+    assert np.abs(found - path).max() < 4e-3
 
 
 def test_uneven_timestamps() -> None:
     time_s = TIME_S + np.random.default_rng(9).uniform(-0.4, 0.4, 900) / RATE_HZ
     path = 0.2 * np.sin(0.8 * time_s)
-    flight = smoothed(noisy(path, 1e-3), time_s)
-    assert np.std(flight.value_m[:, 0] - path) < 0.5e-3
+    assert np.std(smoothed(noisy(path, 1e-3), time_s).value_m[:, 0] - path) < 0.5e-3
 
 
 def test_too_short_a_record_is_not_smoothed() -> None:
     value = np.full((200, 3), np.nan)
+    misfit = np.full(200, 0.1)
     value[: LEAST_FRAMES - 1] = 0.0
-    assert smooth_flight(TIME_S[:200], value, np.ones((200, 3))) is None
-    value[: LEAST_FRAMES + 6] = np.random.default_rng(0).normal(scale=1e-3, size=(LEAST_FRAMES + 6, 3))
-    flight = smooth_flight(TIME_S[:200], value, np.ones((200, 3)))
+    assert smooth_flight(TIME_S[:200], value, misfit) is None
+    value[: LEAST_FRAMES + 6] = noisy(np.zeros((LEAST_FRAMES + 6, 3)), 1e-3)
+    flight = smooth_flight(TIME_S[:200], value, misfit)
     assert flight is not None
-    assert np.isfinite(flight.value_m[: LEAST_FRAMES + 6]).all()
+    assert np.isfinite(flight.value_m).all()
+    assert flight.models[0].cutoff_hz in CUTOFFS_HZ
