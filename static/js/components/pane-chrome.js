@@ -28,6 +28,8 @@ export function paneChrome(pane, { title, readout }) {
   pane.on("view", show);
   show();
   return {
+    /** After a view was set from elsewhere. */
+    refresh: show,
     /** @param {string} words */
     setTitle(words) {
       name.textContent = words;

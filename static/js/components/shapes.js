@@ -17,9 +17,9 @@ import { distance, distanceToSegment, isInside } from "../lib/coordinates.js";
  */
 
 const GRAB_RADIUS = { mark: 14, handle: 13, arrow: 0, polyline: 8, polygon: 7 };
-const MARK = "M-11 0H-3.500M3.500 0H11M0-11V-3.500M0 3.500V11M6.500 0a6.500 6.500 0 1 1-13 0 6.500 6.500 0 1 1 13 0";
-const HANDLE = "M4.500 0a4.500 4.500 0 1 1-9 0 4.500 4.500 0 1 1 9 0";
-const HANDLE_CORE = "M2.500 0a2.500 2.500 0 1 1-5 0 2.500 2.500 0 1 1 5 0";
+const MARK = "M-11 0H-3.5M3.5 0H11M0-11V-3.5M0 3.5V11M6.5 0a6.5 6.5 0 1 1-13 0 6.5 6.5 0 1 1 13 0";
+const HANDLE = "M4.5 0a4.5 4.5 0 1 1-9 0 4.5 4.5 0 1 1 9 0";
+const HANDLE_CORE = "M2.5 0a2.5 2.5 0 1 1-5 0 2.5 2.5 0 1 1 5 0";
 
 /** The SVG elements of a pane's shapes, made once per id and moved afterwards. */
 export class ShapeLayer {
