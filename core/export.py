@@ -220,7 +220,7 @@ def summary_of(results: Results, check: GpsCheck | None, warnings: list[str]) ->
         "duration_s": float(recording.time_s[-1]) if len(recording.time_s) else None,
         "frames_measured": results.frames_measured,
         "seconds": measuring_s,
-        "frames_per_second": results.frames_measured / measuring_s if measuring_s > 0 else None,
+        "frames_per_second": results.frames_measured / measuring_s if results.frames_measured else None,
         "solving_seconds": results.solving_s,
         "reference_fit": _reference_summary(solution),
         "ground_fit": _ground_summary(solution.ground),

@@ -194,7 +194,7 @@ def all_lost(solution: Solution) -> Solution:
 
 def test_a_video_without_one_good_frame_is_told_in_nulls(video: Path, tmp_path: Path) -> None:
     project = scene.project_document(**WITH_GPS)
-    write_results(tmp_path, results(video, project, all_lost(solved()), gps=gps_record(), measuring_s=0.0))
+    write_results(tmp_path, results(video, project, all_lost(solved()), gps=gps_record(), frames_measured=0))
     stored = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     roof = stored["targets"]["roof"]
     assert roof["counts"]["lost"] == scene.FRAMES
