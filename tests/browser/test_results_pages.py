@@ -72,7 +72,7 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
         page.goto(f"{address}/p/small/track")
         expect(page.locator(".note.info")).to_contain_text(f"{kept} of {FRAMES} frames")
         page.keyboard.press("r")
-        expect(page.get_by_role("link", name="Review the result")).to_be_visible(timeout=60_000)
+        expect(page.get_by_role("link", name="Review the result")).to_be_visible(timeout=240_000)
         page.goto(f"{address}/p/small/export")
         with page.expect_download() as download:
             page.wait_for_selector("a[data-main]")

@@ -3,7 +3,7 @@
 import { get, post, projectPath } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { fixed, millimetres } from "../lib/format.js";
-import { newestOnly } from "../lib/newest.js";
+import { latest } from "../lib/latest.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { busyOver } from "../components/busy.js";
 import { AXES, fetchHistory, fetchResults } from "../components/histories.js";
@@ -67,9 +67,9 @@ const history = new Plot(mainArea, { title: "Displacement", unit: "m", drag: "se
 const sweepPlot = new Plot(lowerArea, { title: "RMS before the event", unit: "m", xUnit: "Hz", drag: "seek", zeroY: true, seekStep: CORNER_STEP_HZ });
 const spectrumPlot = new Plot(lowerArea, { title: "Spectrum", unit: "m", xUnit: "Hz", drag: "view", logX: true, logY: true });
 const fields = intervalFields(intervalBox, saveInterval);
-const refilter = newestOnly(askFilter, showAnswer, (error) => (opened(), toastError(error)));
-const resweep = newestOnly(askSweep, showSweep, (error) => showSweepProblem(error));
-const respectrum = newestOnly(askSpectra, showSpectra, () => undefined);
+const refilter = latest(askFilter, showAnswer, (error) => (opened(), toastError(error)));
+const resweep = latest(askSweep, showSweep, (error) => showSweepProblem(error));
+const respectrum = latest(askSpectra, showSpectra, () => undefined);
 const solver = new Solver(page, () => results.ready && !results.stale, (busy) => (solving.hidden = !busy));
 
 history.on("select", ({ from, to }) => saveInterval("pre_event", [from, to]));
