@@ -112,8 +112,7 @@ const table = sortableTable({
   empty: "Click a place in either picture, then the same place in the other.",
   id: (/** @type {Correspondence} */ pair) => String(pair.id),
   rowClass: (pair) => (pair.enabled ? "" : "off"),
-  onSelect: (pair) => slots.select(pair.id),
-  onOpen: (pair) => goTo(pair.id),
+  onSelect: (pair) => goTo(pair.id),
   columns: [
     { key: "on", title: "On", cell: (pair) => h("input", { type: "checkbox", checked: pair.enabled, "aria-label": `Pair ${pair.id} counts`, onclick: (/** @type {Event} */ event) => (event.stopPropagation(), slots.toggle(pair.id)) }) },
     { key: "id", title: "Pair", number: true, cell: (pair) => String(pair.id), sort: (pair) => pair.id },

@@ -24,7 +24,7 @@ export function selectionPanel(element, slots, { goTo }) {
   const fields = FIELDS.map((field) => numberField({ ...field, value: null, optional: true, compact: true, onChange: (value) => type(field.side, field.axis, value) }));
   /** Typed coordinates whose other axis is still empty. @type {Record<Side, [number | null, number | null]>} */
   let typed = { frame_px: [null, null], ground_m: [null, null] };
-  let shown = /** @type {number | null} */ (null);
+  let shown = /** @type {number | undefined} */ (undefined);
   fill(
     element,
     h("header", {}, title, h("label", { class: "switch small" }, on, "counts"), zoom, remove),
@@ -45,17 +45,17 @@ export function selectionPanel(element, slots, { goTo }) {
     if (a !== null && b !== null) slots.move(now.id, side, [a, b]);
   };
   return {
+    /** Always there, also for no pair: the table below must not move under a double click. */
     show() {
       const now = entry();
-      element.hidden = now === undefined;
-      if (now === undefined) return;
-      if (shown !== now.id) typed = { frame_px: [null, null], ground_m: [null, null] };
-      shown = now.id;
-      const pair = slots.pairs.find((candidate) => candidate.id === now.id);
-      title.textContent = pair ? `Pair ${now.id}` : `Pair ${now.id}, unfinished`;
+      if (shown !== now?.id) typed = { frame_px: [null, null], ground_m: [null, null] };
+      shown = now?.id;
+      const pair = slots.pairs.find((candidate) => candidate.id === now?.id);
+      title.textContent = now === undefined ? "No pair selected" : pair ? `Pair ${now.id}` : `Pair ${now.id}, unfinished`;
       on.checked = pair?.enabled ?? false;
       on.disabled = pair === undefined;
-      FIELDS.forEach(({ side, axis }, i) => fields[i].set(now[side]?.[axis] ?? typed[side][axis]));
+      for (const control of [zoom, remove, ...fields.map((field) => field.input)]) control.disabled = now === undefined;
+      FIELDS.forEach(({ side, axis }, i) => fields[i].set(now?.[side]?.[axis] ?? typed[side][axis]));
     },
   };
 }
