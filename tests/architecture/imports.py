@@ -63,7 +63,6 @@ STEPS = {"georeference", "ground", "roof_lines", "motion", "flight", "drift", "v
 CONDUCTORS = {
     "bodies",
     "following",
-    "bodies",
     "paper",
     "measure",
     "preview",
