@@ -40,7 +40,8 @@ def measure_on_cluster(
     with client:
         futures = [client.submit(work, setup, start, stop, reference, pure=False, retries=3) for start, stop in chunks]
         try:
-            for future in as_completed(futures):
+            # Its loop must be named: this client is nobody's default.
+            for future in as_completed(futures, loop=client.loop):
                 yield from future.result()
         finally:
             client.cancel(futures)
