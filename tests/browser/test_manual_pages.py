@@ -381,6 +381,7 @@ def test_inputs_are_sent_taken_back_and_calibrated(browser, project, tmp_path):
         files = page.get_by_role("listbox", name="Files")
         files.get_by_role("option", name="footage").click()
         files.get_by_role("option", name="checkerboards").click()
+        expect(files.get_by_role("option", name="board_01.jpg")).to_be_visible()
         for board in files.get_by_role("option").all():
             board.click()
         page.get_by_role("button", name=re.compile(r"Choose \d+ files")).click()
