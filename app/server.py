@@ -97,6 +97,7 @@ async def _life(app: FastAPI) -> AsyncIterator[None]:
 def _tidy_and_go_on(context: Context) -> None:
     for part in context.workspace.folder.glob(".incoming-*"):
         part.unlink(missing_ok=True)
+    context.workspace.empty_trash()
     for folder in context.workspace.projects():
         folder.remove_parts()
     for folder, job in context.jobs.go_on(context.workspace, {"track": results.finish_track(context)}):

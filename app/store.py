@@ -8,6 +8,7 @@ import re
 import secrets
 import shutil
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -39,6 +40,7 @@ INPUT_KINDS = ("video", "cloud", "lens", "gps")
 _RESERVED = {PROJECT_FILE, HISTORY_FILE, RESULTS_FOLDER, CHECKERBOARD_FOLDER}
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,79}")
 _PART_PREFIX = ".incoming-"
+_TRASH_KEPT_S = 31 * 86_400.0
 
 
 @dataclass(frozen=True)
@@ -314,6 +316,13 @@ class Workspace:
         os.rename(found[0], target)
         place.rmdir()
         return self.open(target.name)
+
+    def empty_trash(self) -> None:
+        """Remove what was thrown away more than a month ago."""
+        trash = self.folder / TRASH_FOLDER
+        for place in trash.iterdir() if trash.is_dir() else ():
+            if time.time() - place.stat().st_mtime > _TRASH_KEPT_S:
+                shutil.rmtree(place, ignore_errors=True)
 
     def adopt(self, folder: Path, name: str) -> ProjectFolder:
         """Take a finished project folder, lying elsewhere in the workspace, in under a free id."""

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import FileResponse
 from starlette.concurrency import run_in_threadpool
@@ -26,6 +27,7 @@ from core.video import frame_index, probe
 
 router = APIRouter(prefix="/api")
 
+_SHOWN_AS_THEY_ARE = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 UploadKind = Literal["video", "cloud", "lens", "gps", "checkerboard"]
 
 
@@ -177,9 +179,26 @@ def remove_lens_image(name: str, folder: Folder) -> dict[str, Any]:
 
 
 @router.get("/projects/{project_id}/lens/images/{name}")
-def lens_image(name: str, folder: Folder) -> Response:
-    """Return a checkerboard picture."""
-    return FileResponse(_lens_image(folder, name))
+def lens_image(name: str, folder: Folder, here: Here) -> Response:
+    """Return a checkerboard picture: one that was sent, or one the last calibration took from this computer."""
+    try:
+        path = _lens_image(folder, name)
+    except Missing:
+        path = _calibrated_image(here, folder, name)
+    if path.suffix.lower() in _SHOWN_AS_THEY_ARE:
+        return FileResponse(path)
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise Invalid(f"{name}: cannot be read as a picture; take it out and send it again.", path=name)
+    return Response(cv2.imencode(".png", picture)[1].tobytes(), media_type="image/png")
+
+
+def _calibrated_image(here: Context, folder: ProjectFolder, name: str) -> Path:
+    report = read_json(folder.results / REPORT_FILE)
+    for file in report.get("files", []) if isinstance(report, dict) else []:
+        if Path(file).name == name and kind_of(Path(file)) == "image":
+            return here.places.file(file)
+    raise Missing(f"{name}: there is no such checkerboard picture.", path=name)
 
 
 def checkerboard_images(folder: ProjectFolder) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import threading
 import time
@@ -200,3 +201,15 @@ def test_frames_are_shown_raw_undistorted_and_smaller(client: TestClient) -> Non
     assert cv2.imdecode(np.frombuffer(small, np.uint8), cv2.IMREAD_COLOR).shape == (60, 80, 3)
     answer = client.get(f"{SMALL}/frames/40.jpg")
     assert (answer.status_code, answer.json()["error"]["kind"]) == (422, "input")
+
+
+def test_pictures_of_a_calibration_from_this_computer_are_shown_too(client: TestClient, workspace: Path) -> None:
+    picture = np.full((6, 8, 3), 90, np.uint8)
+    cv2.imwrite(str(workspace / "board.tif"), picture)
+    (workspace / "small" / "results").mkdir()
+    report = {"files": [str(workspace / "board.tif"), "/etc/hostname.png"]}
+    (workspace / "small" / "results" / "lens_report.json").write_text(json.dumps(report))
+    answer = client.get(f"{SMALL}/lens/images/board.tif")
+    assert answer.headers["content-type"] == "image/png"
+    assert np.array_equal(cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR), picture)
+    assert client.get(f"{SMALL}/lens/images/hostname.png").status_code == 403

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
+from app.context import Context
 from app.server import create_app
 from tests.app.conftest import ADDRESS, WRITE
 
@@ -188,3 +191,16 @@ def test_a_broken_project_file_is_listed_with_its_problem(client: TestClient, wo
     assert "line 1" in project["steps"]["inputs"]["message"]
     answer = client.get(SMALL)
     assert (answer.status_code, answer.json()["error"]["kind"]) == (422, "input")
+
+
+def test_the_trash_is_emptied_after_a_month(client: TestClient, context: Context, workspace: Path) -> None:
+    old, new = (client.delete(f"/api/projects/{name}").json()["undo_token"] for name in _two_projects(client))
+    month_ago_s = time.time() - 32 * 86_400
+    os.utime(workspace / ".trash" / old, (month_ago_s, month_ago_s))
+    context.workspace.empty_trash()
+    assert client.post("/api/projects/untrash", json={"undo_token": old}).status_code == 404
+    assert client.post("/api/projects/untrash", json={"undo_token": new}).status_code == 200
+
+
+def _two_projects(client: TestClient) -> list[str]:
+    return ["small", client.post("/api/projects", json={"name": "other"}).json()["id"]]
