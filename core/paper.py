@@ -18,6 +18,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from core.coordinates import Floats, apply_homography
 from core.errors import InputError
@@ -31,12 +32,16 @@ from core.project import LINE_NAMES, Band, Target
 from core.video import Luma
 
 # Matches per frame of the paper: 300-500.
-FEATURES = 600
+FEATURES = 500
 LEAST_MATCHES = 20
 # Half the side of the window SIFT looks into around an expected feature, pixels: the support of its descriptor at the
 # scales kept, and two pixels of prediction error.
 WINDOW_PX = 28
-LARGEST_SIZE_PX = 9.0
+LARGEST_SIZE_PX = 5.0
+# How far from its expected place a match may lie, pixels.
+NEAR_PX = 4.0
+# Difference of two descriptors beyond which they show different places, out of 512.
+MOST_DIFFERENCE = 250.0
 # Lowe's ratio between the best and the second-best sum of squared differences.
 RATIO = 0.8
 # The orthorectified band is sampled about as finely as the camera saw it.
@@ -104,40 +109,54 @@ class SiftGround:
         return None
 
     def _match(self, luma: Luma, expected_raw: Floats) -> Floats:
-        """Return each feature's match among those found in the window around its expected place."""
-        windows, corners, index = _windows(luma, expected_raw)
-        matched = np.full_like(expected_raw, np.nan)
-        if not len(index):
-            return matched
+        """Return each feature's match (N, 2) among those found within the window around its expected place."""
         side = 2 * WINDOW_PX
-        columns = int(np.ceil(np.sqrt(len(index))))
-        mosaic = _mosaic(windows, columns)
-        keypoints, descriptors = self._sift.detectAndCompute(mosaic, None)
-        if not keypoints:
-            return matched
-        places = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64)
-        tile = (places[:, 1] // side).astype(int) * columns + (places[:, 0] // side).astype(int)
-        inner = np.abs(places % side - WINDOW_PX).max(axis=1) < WINDOW_PX - 4
-        usable = np.flatnonzero(inner & (tile < len(index)))
-        best = self._best_of_tiles(np.asarray(descriptors, dtype=np.float32)[usable], tile[usable], index)
-        for number, candidate in best.items():
-            within = places[usable[candidate]] % side
-            matched[index[number]] = corners[number] + within
+        if luma.size > 1.5 * len(expected_raw) * side**2:
+            places, descriptors, index = self._seen_in_windows(luma, expected_raw)
+        else:
+            places, descriptors = self._detect(luma)
+            index = np.arange(len(expected_raw))
+        candidates: list[list[int]] = list(
+            cKDTree(places).query_ball_point(np.nan_to_num(expected_raw[index], nan=-1e6), NEAR_PX)
+        )
+        matched = np.full_like(expected_raw, np.nan)
+        for number, near in zip(index.tolist(), candidates, strict=True):
+            if near:
+                best = self._best(number, descriptors[near])
+                if best is not None:
+                    matched[number] = places[near[best]]
         return matched
 
-    def _best_of_tiles(
-        self, descriptors: NDArray[np.float32], tile: NDArray[np.int64], index: NDArray[np.int64]
-    ) -> dict[int, int]:
-        """Return for each window the descriptor of least squared difference, if it is clearly the best."""
-        difference = ((descriptors - self._descriptors[index[tile]]) ** 2).sum(axis=1)
-        order = np.lexsort((difference, tile))
-        tiles, first, count = np.unique(tile[order], return_index=True, return_counts=True)
-        best: dict[int, int] = {}
-        for number, start, several in zip(tiles.tolist(), first.tolist(), count.tolist(), strict=True):
-            leading = difference[order[start]]
-            if leading < 250.0**2 and (several == 1 or leading < RATIO**2 * difference[order[start + 1]]):
-                best[number] = int(order[start])
-        return best
+    def _best(self, number: int, descriptors: NDArray[np.float32]) -> int | None:
+        """Return the descriptor of least sum of squared differences from a feature's, if it is clearly the best."""
+        difference = ((descriptors - self._descriptors[number]) ** 2).sum(axis=1)
+        best = int(difference.argmin())
+        others = np.delete(difference, best)
+        clear = difference[best] < MOST_DIFFERENCE**2 and (others > difference[best] / RATIO**2).all()
+        return best if clear else None
+
+    def _detect(self, picture: Luma) -> tuple[Floats, NDArray[np.float32]]:
+        keypoints, descriptors = self._sift.detectAndCompute(picture, None)
+        if not keypoints:
+            return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
+        return np.array([keypoint.pt for keypoint in keypoints]), np.asarray(descriptors, dtype=np.float32)
+
+    def _seen_in_windows(
+        self, luma: Luma, expected_raw: Floats
+    ) -> tuple[Floats, NDArray[np.float32], NDArray[np.int64]]:
+        """Return what SIFT finds in the windows alone, laid side by side, and which features have a window."""
+        windows, corners, index = _windows(luma, expected_raw)
+        if not windows:
+            return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32), index
+        side = 2 * WINDOW_PX
+        columns = int(np.ceil(np.sqrt(len(windows))))
+        places, descriptors = self._detect(_mosaic(windows, columns))
+        tile = (places // side).astype(np.int64)
+        number = tile[:, 1] * columns + tile[:, 0]
+        # Near the seams a feature sees its neighbour in the mosaic, not in the frame.
+        whole = (number < len(windows)) & (np.abs(places % side - WINDOW_PX).max(axis=1, initial=0.0) < NEAR_PX)
+        own = places[whole] % side + corners[number[whole]]
+        return own, descriptors[whole], index
 
 
 def _spread_strongest(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...], count: int) -> list[int]:
