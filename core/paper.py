@@ -14,6 +14,7 @@ Extraction"; SIFT (Lowe 2004) stands for SURF, which OpenCV's packages do not ca
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -116,9 +117,7 @@ class SiftGround:
         else:
             places, descriptors = self._detect(luma)
             index = np.arange(len(expected_raw))
-        candidates: list[list[int]] = list(
-            cKDTree(places).query_ball_point(np.nan_to_num(expected_raw[index], nan=-1e6), NEAR_PX)
-        )
+        candidates: Any = cKDTree(places).query_ball_point(np.nan_to_num(expected_raw[index], nan=-1e6), NEAR_PX)
         matched = np.full_like(expected_raw, np.nan)
         for number, near in zip(index.tolist(), candidates, strict=True):
             if near:
