@@ -240,10 +240,10 @@ class Scene3D:
             for name, ends in lines_m.items():
                 colour = LINE_COLOURS.get(name.rpartition("/")[2], (230, 230, 230))
                 segment = (ends - self.origin_m).astype(np.float32)[None]
-                add(scene.add_line_segments(f"/lines/{name}", segment, colour, **_thick(5.0)))
+                add(scene.add_line_segments(f"/lines/moved/{name}", segment, colour, **_thick(5.0)))
             for name, ends in rest_m.items():
                 segment = (ends - self.origin_m).astype(np.float32)[None]
-                add(scene.add_line_segments(f"/lines/{name}/rest", segment, _REST_COLOUR, **_thick(1.5)))
+                add(scene.add_line_segments(f"/lines/rest/{name}", segment, _REST_COLOUR, **_thick(1.5)))
 
     def drop(self, part: str) -> None:
         """Take a part out of the scene."""

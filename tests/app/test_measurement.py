@@ -149,10 +149,10 @@ def test_the_scene_shows_camera_and_roof_lines_in_step_with_a_frame(tracked: Tes
     scene = tracked.app.state.context.scene  # type: ignore[attr-defined]
     tall = {"frame": 14, "exaggeration": 10.0}
     assert tracked.post(f"{CLIP}/scene", json={"frame": 14}).json()["ready"]
-    once = _line_points(scene, "roof/T1")
+    once = _line_points(scene, "moved/roof/T1")
     tracked.post(f"{CLIP}/scene", json=tall)
-    tenfold = _line_points(scene, "roof/T1")
-    rest = _line_points(scene, "roof/T1/rest")
+    tenfold = _line_points(scene, "moved/roof/T1")
+    rest = _line_points(scene, "rest/roof/T1")
     moved_m = displacement_m(14 / 20)
     assert (once - rest)[:, 0] == pytest.approx([moved_m, moved_m], abs=0.004)
     assert (tenfold - rest)[:, 0] == pytest.approx([10 * moved_m] * 2, abs=0.04)
@@ -170,7 +170,7 @@ def _line_points(scene: Any, name: str) -> Any:
 def test_tracking_is_cancelled_goes_on_by_itself_after_a_restart_and_ends_as_if_uninterrupted(
     tracked: TestClient, tmp_path: Path
 ) -> None:
-    frames = 200
+    frames = 120
     write_measurable(tmp_path / "clip", frames)
     with TestClient(create_app(tmp_path), base_url=ADDRESS, headers=WRITE) as client:
         folder = client.app.state.context.workspace.open("clip")  # type: ignore[attr-defined]
@@ -184,11 +184,11 @@ def test_tracking_is_cancelled_goes_on_by_itself_after_a_restart_and_ends_as_if_
         second = client.post(f"{CLIP}/orthoimage")
         assert second.status_code in (404, 423)
         assert client.post(f"{CLIP}/track", json={}).status_code == 423
-        _until(lambda: measured() > 20)
+        _until(lambda: measured() > 10)
         client.delete(f"{CLIP}/track")
         assert wait_for(client, job)["state"] == "cancelled"
         kept = measured()
-        assert 20 < kept < frames
+        assert 10 < kept < frames
         state = client.get(f"{CLIP}/track").json()
         assert (state["resumable"], state["frames_done"]) == (True, kept)
         assert len(state["preview"]["roof"]) == kept
