@@ -25,8 +25,15 @@ export function openDialog({ title, body, size = "" }) {
       dialog.remove();
       resolve(result);
     };
-    const dismiss = h("button", { class: "button quiet icon-only", type: "button", "aria-label": "Close", onclick: () => close(null) }, icon("close"));
-    dialog.append(h("header", {}, h("h2", { id: titleId }, title), dismiss), ...body(close).filter((child) => child instanceof Node));
+    const dismiss = h(
+      "button",
+      { class: "button quiet icon-only", type: "button", "aria-label": "Close", onclick: () => close(null) },
+      icon("close"),
+    );
+    dialog.append(
+      h("header", {}, h("h2", { id: titleId }, title), dismiss),
+      ...body(close).filter((child) => child instanceof Node),
+    );
     dialog.addEventListener("cancel", (event) => (event.preventDefault(), close(null)));
     dialog.addEventListener("pointerdown", (event) => event.target === dialog && close(null));
     document.body.append(dialog);
@@ -47,13 +54,34 @@ export function askText({ title, label, value = "", action, hint }) {
     title,
     size: "small",
     body: (close) => {
-      const input = h("input", { class: "input", type: "text", id: "ask-text", value, required: true, autocomplete: "off", spellcheck: "false" });
+      const input = h("input", {
+        class: "input",
+        type: "text",
+        id: "ask-text",
+        value,
+        required: true,
+        autocomplete: "off",
+        spellcheck: "false",
+      });
       const submit = (/** @type {Event} */ event) => {
         event.preventDefault();
         if (input.value.trim() !== "") close(input.value.trim());
       };
-      const field = h("div", { class: "field" }, h("label", { class: "label", for: "ask-text" }, label), input, hint && h("p", { class: "hint" }, hint));
-      return [h("form", { class: "dialog-form", onsubmit: submit }, h("div", { class: "dialog-body" }, field), dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, action)))];
+      const field = h(
+        "div",
+        { class: "field" },
+        h("label", { class: "label", for: "ask-text" }, label),
+        input,
+        hint && h("p", { class: "hint" }, hint),
+      );
+      return [
+        h(
+          "form",
+          { class: "dialog-form", onsubmit: submit },
+          h("div", { class: "dialog-body" }, field),
+          dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, action)),
+        ),
+      ];
     },
   });
 }

@@ -11,7 +11,11 @@ import { dialogActions, openDialog } from "./dialog.js";
  * @typedef {{dir: string, parent: string | null, roots: string[], entries: Entry[]}} Listing
  */
 
-const ICONS = /** @type {Record<string, import("../lib/icons.js").IconName>} */ ({ dir: "folder", video: "video", cloud: "cube" });
+const ICONS = /** @type {Record<string, import("../lib/icons.js").IconName>} */ ({
+  dir: "folder",
+  video: "video",
+  cloud: "cube",
+});
 const REMEMBERED = "rooftrack-browse-dir";
 
 /**
@@ -23,7 +27,12 @@ export function chooseFiles({ title, kind, multiple = false }) {
     title,
     size: "wide tall",
     body: (close) => {
-      const list = h("ul", { class: "file-list", role: "listbox", "aria-label": "Files", "aria-multiselectable": String(multiple) });
+      const list = h("ul", {
+        class: "file-list",
+        role: "listbox",
+        "aria-label": "Files",
+        "aria-multiselectable": String(multiple),
+      });
       const trail = h("nav", { class: "file-trail", "aria-label": "Folder" });
       const note = h("p", { class: "soft small", role: "status" });
       const choose = h("button", { class: "button primary", type: "button", disabled: true }, "Choose");
@@ -36,14 +45,26 @@ export function chooseFiles({ title, kind, multiple = false }) {
         if (!multiple) chosen.clear();
         if (chosen.has(path)) chosen.delete(path);
         else chosen.add(path);
-        for (const item of list.children) item.setAttribute("aria-selected", String(chosen.has(/** @type {HTMLElement} */ (item).dataset.path ?? "")));
+        for (const item of list.children)
+          item.setAttribute("aria-selected", String(chosen.has(/** @type {HTMLElement} */ (item).dataset.path ?? "")));
         choose.disabled = chosen.size === 0;
         choose.textContent = chosen.size > 1 ? `Choose ${chosen.size} files` : "Choose";
         row.focus();
       };
       const row = (/** @type {Entry} */ entry) => {
-        const element = h("li", { role: "option", tabindex: 0, "aria-selected": "false", "data-path": entry.path }, icon(ICONS[entry.kind ?? ""] ?? (entry.is_dir ? "folder" : "file")), h("span", { class: "name" }, entry.name), h("span", { class: "faint number" }, entry.is_dir ? "" : size(entry.size)));
-        const open = () => (entry.is_dir ? void go(entry.path) : multiple ? pick(element, entry.path) : (pick(element, entry.path), chosen.add(entry.path), finish()));
+        const element = h(
+          "li",
+          { role: "option", tabindex: 0, "aria-selected": "false", "data-path": entry.path },
+          icon(ICONS[entry.kind ?? ""] ?? (entry.is_dir ? "folder" : "file")),
+          h("span", { class: "name" }, entry.name),
+          h("span", { class: "faint number" }, entry.is_dir ? "" : size(entry.size)),
+        );
+        const open = () =>
+          entry.is_dir
+            ? void go(entry.path)
+            : multiple
+              ? pick(element, entry.path)
+              : (pick(element, entry.path), chosen.add(entry.path), finish());
         element.addEventListener("click", () => (entry.is_dir ? open() : pick(element, entry.path)));
         element.addEventListener("dblclick", () => !entry.is_dir && open());
         element.addEventListener("keydown", (event) => onRowKey(event, element, open));
@@ -53,9 +74,14 @@ export function chooseFiles({ title, kind, multiple = false }) {
         chosen.clear();
         choose.disabled = true;
         try {
-          const listing = /** @type {Listing} */ (await get(`browse?kind=${kind}${dir === null ? "" : `&dir=${encodeURIComponent(dir)}`}`));
+          const listing = /** @type {Listing} */ (
+            await get(`browse?kind=${kind}${dir === null ? "" : `&dir=${encodeURIComponent(dir)}`}`)
+          );
           localStorage.setItem(REMEMBERED, listing.dir);
-          fill(trail, crumbs(listing, (path) => void go(path)));
+          fill(
+            trail,
+            crumbs(listing, (path) => void go(path)),
+          );
           fill(list, listing.entries.map(row));
           note.textContent = listing.entries.length === 0 ? "Nothing of this kind here." : "";
           /** @type {HTMLElement | null} */ (list.firstElementChild)?.focus();
@@ -65,22 +91,48 @@ export function chooseFiles({ title, kind, multiple = false }) {
         }
       };
       void go(localStorage.getItem(REMEMBERED));
-      return [h("div", { class: "dialog-body file-browser" }, trail, list, note), dialogActions(() => close(null), choose)];
+      return [
+        h("div", { class: "dialog-body file-browser" }, trail, list, note),
+        dialogActions(() => close(null), choose),
+      ];
     },
   });
 }
 
 /** @param {Listing} listing @param {(path: string) => void} go */
 function crumbs(listing, go) {
-  const button = (/** @type {string} */ path, /** @type {string} */ name) => h("button", { class: "button quiet small", type: "button", onclick: () => go(path) }, name);
-  const up = h("button", { class: "button quiet small icon-only", type: "button", "aria-label": "Folder above", disabled: listing.parent === null, onclick: () => listing.parent !== null && go(listing.parent) }, icon("arrow_left"));
-  const roots = listing.roots.filter((root) => root !== listing.dir).map((root) => button(root, root.split("/").filter(Boolean).at(-1) ?? root));
-  return [up, h("span", { class: "path" }, listing.dir), h("span", { class: "spring" }), ...(roots.length > 0 ? [h("span", { class: "faint small" }, "Go to"), ...roots] : [])];
+  const button = (/** @type {string} */ path, /** @type {string} */ name) =>
+    h("button", { class: "button quiet small", type: "button", onclick: () => go(path) }, name);
+  const up = h(
+    "button",
+    {
+      class: "button quiet small icon-only",
+      type: "button",
+      "aria-label": "Folder above",
+      disabled: listing.parent === null,
+      onclick: () => listing.parent !== null && go(listing.parent),
+    },
+    icon("arrow_left"),
+  );
+  const roots = listing.roots
+    .filter((root) => root !== listing.dir)
+    .map((root) => button(root, root.split("/").filter(Boolean).at(-1) ?? root));
+  return [
+    up,
+    h("span", { class: "path" }, listing.dir),
+    h("span", { class: "spring" }),
+    ...(roots.length > 0 ? [h("span", { class: "faint small" }, "Go to"), ...roots] : []),
+  ];
 }
 
 /** @param {KeyboardEvent} event @param {HTMLElement} element @param {() => void} open */
 function onRowKey(event, element, open) {
-  const to = event.key === "ArrowDown" ? element.nextElementSibling : event.key === "ArrowUp" ? element.previousElementSibling : null;
+  const to =
+    event.key === "ArrowDown"
+      ? element.nextElementSibling
+      : event.key === "ArrowUp"
+        ? element.previousElementSibling
+        : null;
   if (to instanceof HTMLElement) {
     event.preventDefault();
     to.focus();

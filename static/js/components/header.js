@@ -23,12 +23,30 @@ export const STEPS = [
   { step: "export", name: "Export" },
 ];
 
-const STATUS_ICONS = /** @type {const} */ ({ done: "check", warn: "warn", error: "close", stale: "stale", running: "running" });
-const STATUS_WORDS = { todo: "to do", done: "done", warn: "done, with a warning", error: "needs attention", stale: "out of date", running: "running" };
+const STATUS_ICONS = /** @type {const} */ ({
+  done: "check",
+  warn: "warn",
+  error: "close",
+  stale: "stale",
+  running: "running",
+});
+const STATUS_WORDS = {
+  todo: "to do",
+  done: "done",
+  warn: "done, with a warning",
+  error: "needs attention",
+  stale: "out of date",
+  running: "running",
+};
 
 /** Header of a page outside any project. @param {...Node} actions */
 export function projectsHeader(...actions) {
-  fill(find("#header"), brand(), h("span", { class: "steps" }), h("div", { class: "header-actions" }, ...actions, themeButton(), helpButton("Projects")));
+  fill(
+    find("#header"),
+    brand(),
+    h("span", { class: "steps" }),
+    h("div", { class: "header-actions" }, ...actions, themeButton(), helpButton("Projects")),
+  );
   bindKeys([helpKey("Projects")]);
 }
 
@@ -40,14 +58,23 @@ export function projectHeader(store, step) {
   const saved = h("span", { class: "save-state", role: "status" });
   const undo = actionButton("undo", "Undo", () => store.undo().catch(toastError));
   const redo = actionButton("redo", "Redo", () => store.redo().catch(toastError));
-  fill(find("#header"), brand(), name, steps, h("div", { class: "header-actions" }, saved, undo, redo, themeButton(), helpButton(title)));
+  fill(
+    find("#header"),
+    brand(),
+    name,
+    steps,
+    h("div", { class: "header-actions" }, saved, undo, redo, themeButton(), helpButton(title)),
+  );
 
   const show = () => {
     const { state } = store;
     name.textContent = store.project.name;
     name.title = store.project.name;
     document.title = `${title} · ${store.project.name} · Rooftrack`;
-    fill(steps, STEPS.map((entry, i) => stepLink(state.id, entry, i + 1, state.steps?.[entry.step], entry.step === step)));
+    fill(
+      steps,
+      STEPS.map((entry, i) => stepLink(state.id, entry, i + 1, state.steps?.[entry.step], entry.step === step)),
+    );
     setAction(undo, state.can_undo, `Undo${state.undo_label ? `: ${state.undo_label}` : ""} (Ctrl+Z)`);
     setAction(redo, state.can_redo, `Redo${state.redo_label ? `: ${state.redo_label}` : ""} (Ctrl+Shift+Z)`);
   };
@@ -55,7 +82,15 @@ export function projectHeader(store, step) {
   store.on("saving", (state) => showSaving(saved, state));
   show();
   showSaving(saved, "saved");
-  bindKeys([helpKey(title), ...STEPS.map((entry, i) => ({ keys: `Alt+${i + 1}`, group: "Everywhere", label: entry.name, run: () => location.assign(stepUrl(store.id, entry.step)) }))]);
+  bindKeys([
+    helpKey(title),
+    ...STEPS.map((entry, i) => ({
+      keys: `Alt+${i + 1}`,
+      group: "Everywhere",
+      label: entry.name,
+      run: () => location.assign(stepUrl(store.id, entry.step)),
+    })),
+  ]);
 }
 
 /** @param {string} id @param {StepName} step */
@@ -72,7 +107,13 @@ function stepLink(id, entry, number, state, current) {
   const words = `${entry.name}: ${STATUS_WORDS[status]}${state?.message ? `. ${state.message}` : ""}`;
   return h(
     "a",
-    { href: stepUrl(id, entry.step), "aria-current": current ? "page" : null, title: words, "data-step": entry.step, "data-status": status },
+    {
+      href: stepUrl(id, entry.step),
+      "aria-current": current ? "page" : null,
+      title: words,
+      "data-step": entry.step,
+      "data-status": status,
+    },
     statusMark(status, number),
     h("span", { class: "name" }, entry.name),
     h("span", { class: "visually-hidden" }, `, ${STATUS_WORDS[status]}`),
@@ -84,14 +125,22 @@ function brand() {
     "svg",
     { viewBox: "0 0 24 24", "aria-hidden": "true" },
     svg("rect", { x: 1, y: 1, width: 22, height: 22, rx: 6, fill: "#0a5fb4" }),
-    svg("path", { d: "M6 15.500 12 7l6 8.500", fill: "none", stroke: "#fff", "stroke-width": 2, "stroke-linecap": "round", "stroke-linejoin": "round" }),
+    svg("path", {
+      d: "M6 15.500 12 7l6 8.500",
+      fill: "none",
+      stroke: "#fff",
+      "stroke-width": 2,
+      "stroke-linecap": "round",
+      "stroke-linejoin": "round",
+    }),
     svg("circle", { cx: 12, cy: 15, r: 2.2, fill: "#ffd23f" }),
   );
   return h("a", { class: "brand", href: "/", title: "All projects" }, logo, "Rooftrack");
 }
 
 /** @param {"undo" | "redo"} name @param {string} label @param {() => void} run */
-const actionButton = (name, label, run) => h("button", { class: "button quiet icon-only", type: "button", "aria-label": label, onclick: run }, icon(name));
+const actionButton = (name, label, run) =>
+  h("button", { class: "button quiet icon-only", type: "button", "aria-label": label, onclick: run }, icon(name));
 
 /** @param {HTMLButtonElement} button @param {boolean} enabled @param {string} words */
 function setAction(button, enabled, words) {
@@ -105,11 +154,19 @@ function showSaving(element, state) {
   const words = { saved: "Saved", saving: "Saving…", failed: "Not saved" }[state];
   element.className = `save-state ${state === "failed" ? "bad" : ""}`;
   element.dataset.state = state;
-  fill(element, icon(state === "saved" ? "check" : state === "saving" ? "running" : "warn", "small"), h("span", { class: "word" }, words));
+  fill(
+    element,
+    icon(state === "saved" ? "check" : state === "saving" ? "running" : "warn", "small"),
+    h("span", { class: "word" }, words),
+  );
 }
 
 function themeButton() {
-  const button = h("button", { class: "button quiet icon-only", type: "button", "aria-label": "Light or dark", title: "Light or dark" }, icon(themeIcon()));
+  const button = h(
+    "button",
+    { class: "button quiet icon-only", type: "button", "aria-label": "Light or dark", title: "Light or dark" },
+    icon(themeIcon()),
+  );
   button.addEventListener("click", () => {
     nextTheme();
     fill(button, icon(themeIcon()));
@@ -118,7 +175,18 @@ function themeButton() {
 }
 
 /** @param {string} title */
-const helpButton = (title) => h("button", { class: "button quiet icon-only", type: "button", "aria-label": "Keys and gestures (?)", title: "Keys and gestures (?)", onclick: () => openHelp(title) }, icon("help"));
+const helpButton = (title) =>
+  h(
+    "button",
+    {
+      class: "button quiet icon-only",
+      type: "button",
+      "aria-label": "Keys and gestures (?)",
+      title: "Keys and gestures (?)",
+      onclick: () => openHelp(title),
+    },
+    icon("help"),
+  );
 
 /** @param {string} title @returns {import("../lib/keys.js").KeyBinding} */
 const helpKey = (title) => ({ keys: "?", group: "Everywhere", label: "This list", run: () => openHelp(title) });

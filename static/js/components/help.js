@@ -9,8 +9,14 @@ export function openHelp(title) {
   /** @type {Map<string, import("../lib/keys.js").KeyBinding[]>} */
   const groups = new Map();
   for (const binding of keyTable()) groups.set(binding.group, [...(groups.get(binding.group) ?? []), binding]);
-  const sections = [...groups].map(([group, bindings]) => h("section", {}, h("h3", {}, group), h("dl", { class: "keys" }, bindings.flatMap(row))));
-  void openDialog({ title: `Keys and gestures: ${title}`, size: "wide", body: () => [h("div", { class: "dialog-body help" }, sections)] });
+  const sections = [...groups].map(([group, bindings]) =>
+    h("section", {}, h("h3", {}, group), h("dl", { class: "keys" }, bindings.flatMap(row))),
+  );
+  void openDialog({
+    title: `Keys and gestures: ${title}`,
+    size: "wide",
+    body: () => [h("div", { class: "dialog-body help" }, sections)],
+  });
 }
 
 /** @param {import("../lib/keys.js").KeyBinding} binding */

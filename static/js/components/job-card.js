@@ -38,7 +38,11 @@ export function jobCard({ unit = "" } = {}) {
       element.classList.toggle("failed", failed);
       cancel.hidden = !isRunning(job);
       bar.hidden = failed;
-      stage.textContent = failed ? (job.message ?? "Failed") : job.state === "queued" ? "Waiting for its turn" : job.stage || "Starting";
+      stage.textContent = failed
+        ? (job.message ?? "Failed")
+        : job.state === "queued"
+          ? "Waiting for its turn"
+          : job.stage || "Starting";
       numbers.textContent = isRunning(job) ? progressWords(job, unit) : "";
       if (job.total > 0) bar.value = job.done / job.total;
       else bar.removeAttribute("value");

@@ -81,7 +81,9 @@ export class Loupe {
 
 /** @param {CanvasRenderingContext2D} context @param {number} x @param {number} y */
 function drawCross(context, x, y) {
-  const arms = new Path2D(`M${x - 60} ${y}H${x - 5}M${x + 5} ${y}H${x + 60}M${x} ${y - 60}V${y - 5}M${x} ${y + 5}V${y + 60}`);
+  const arms = new Path2D(
+    `M${x - 60} ${y}H${x - 5}M${x + 5} ${y}H${x + 60}M${x} ${y - 60}V${y - 5}M${x} ${y + 5}V${y + 60}`,
+  );
   context.lineWidth = 3;
   context.strokeStyle = "rgb(8 10 13 / 70%)";
   context.stroke(arms);

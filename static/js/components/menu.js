@@ -12,8 +12,21 @@ import { icon } from "../lib/icons.js";
  * @param {() => MenuItem[]} options.items  asked each time it opens
  */
 export function menuButton({ label, icon: name, items }) {
-  const button = h("button", { class: `button ${name ? "quiet icon-only" : ""}`, type: "button", "aria-haspopup": "menu", "aria-expanded": "false", "aria-label": label, title: label }, name ? icon(name) : label);
-  button.addEventListener("click", () => (button.getAttribute("aria-expanded") === "true" ? undefined : open(button, items())));
+  const button = h(
+    "button",
+    {
+      class: `button ${name ? "quiet icon-only" : ""}`,
+      type: "button",
+      "aria-haspopup": "menu",
+      "aria-expanded": "false",
+      "aria-label": label,
+      title: label,
+    },
+    name ? icon(name) : label,
+  );
+  button.addEventListener("click", () =>
+    button.getAttribute("aria-expanded") === "true" ? undefined : open(button, items()),
+  );
   return button;
 }
 
@@ -23,7 +36,14 @@ function open(button, items) {
   const close = () => (list.isConnected && list.hidePopover(), button.focus());
   for (const item of items) {
     const run = () => (close(), item.run());
-    list.append(h("button", { class: item.danger ? "danger" : "", role: "menuitem", type: "button", disabled: item.disabled, onclick: run }, item.icon ? icon(item.icon) : null, item.label));
+    list.append(
+      h(
+        "button",
+        { class: item.danger ? "danger" : "", role: "menuitem", type: "button", disabled: item.disabled, onclick: run },
+        item.icon ? icon(item.icon) : null,
+        item.label,
+      ),
+    );
   }
   list.addEventListener("keydown", (event) => moveFocus(event, list));
   list.addEventListener("toggle", (event) => {

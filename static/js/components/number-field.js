@@ -23,11 +23,42 @@ let fields = 0;
 
 /** @param {NumberFieldOptions} options */
 export function numberField(options) {
-  const { label, unit, onChange, decimals = 2, step = 10 ** -decimals, min = -Infinity, max = Infinity, optional = false } = options;
+  const {
+    label,
+    unit,
+    onChange,
+    decimals = 2,
+    step = 10 ** -decimals,
+    min = -Infinity,
+    max = Infinity,
+    optional = false,
+  } = options;
   const id = `number-${(fields += 1)}`;
-  const input = h("input", { class: "input", id, type: "text", inputmode: "decimal", autocomplete: "off", spellcheck: "false", placeholder: options.placeholder ?? (optional ? "–" : ""), "aria-label": options.bare ? `${label}${unit ? `, ${unit}` : ""}` : null });
-  const box = h("div", { class: `number-field ${options.compact ? "compact" : ""}` }, input, h("span", { class: "unit" }, unit));
-  const element = options.bare ? box : h("div", { class: "field" }, h("label", { class: "label", for: id }, label), box, options.hint && h("p", { class: "hint" }, options.hint));
+  const input = h("input", {
+    class: "input",
+    id,
+    type: "text",
+    inputmode: "decimal",
+    autocomplete: "off",
+    spellcheck: "false",
+    placeholder: options.placeholder ?? (optional ? "–" : ""),
+    "aria-label": options.bare ? `${label}${unit ? `, ${unit}` : ""}` : null,
+  });
+  const box = h(
+    "div",
+    { class: `number-field ${options.compact ? "compact" : ""}` },
+    input,
+    h("span", { class: "unit" }, unit),
+  );
+  const element = options.bare
+    ? box
+    : h(
+        "div",
+        { class: "field" },
+        h("label", { class: "label", for: id }, label),
+        box,
+        options.hint && h("p", { class: "hint" }, options.hint),
+      );
   let current = options.value;
 
   const show = () => {
@@ -44,7 +75,8 @@ export function numberField(options) {
     const text = input.value.trim().replace(",", ".").replace("\u2212", "-");
     if (text === "" && optional) return take(null);
     const value = Number(text);
-    if (text === "" || !Number.isFinite(value) || value < min || value > max) return input.setAttribute("aria-invalid", "true");
+    if (text === "" || !Number.isFinite(value) || value < min || value > max)
+      return input.setAttribute("aria-invalid", "true");
     if (current !== null && text === current.toFixed(decimals)) return show();
     take(value);
   };

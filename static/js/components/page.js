@@ -35,7 +35,8 @@ export async function openPage(step) {
     tellTroubles(store);
     events.on("hello", ({ revision }) => store.heardOf(revision));
     events.on("project", ({ revision }) => store.heardOf(revision));
-    for (const name of /** @type {const} */ (["inputs", "orthoimage", "results"])) events.on(name, () => void store.refresh().catch(toastError));
+    for (const name of /** @type {const} */ (["inputs", "orthoimage", "results"]))
+      events.on(name, () => void store.refresh().catch(toastError));
     bindKeys(historyKeys(store));
     return { id, step, store, events, keys: bindKeys };
   } catch (error) {
@@ -50,15 +51,31 @@ export const nextStep = (step) => STEPS[STEPS.findIndex((entry) => entry.step ==
 /** @param {ProjectStore} store @returns {import("../lib/keys.js").KeyBinding[]} */
 function historyKeys(store) {
   return [
-    { keys: "Ctrl+Z", group: "Everywhere", label: "Undo", run: () => store.undo().catch(toastError), when: () => store.state.can_undo },
-    { keys: "Ctrl+Shift+Z / Ctrl+Y", group: "Everywhere", label: "Redo", run: () => store.redo().catch(toastError), when: () => store.state.can_redo },
+    {
+      keys: "Ctrl+Z",
+      group: "Everywhere",
+      label: "Undo",
+      run: () => store.undo().catch(toastError),
+      when: () => store.state.can_undo,
+    },
+    {
+      keys: "Ctrl+Shift+Z / Ctrl+Y",
+      group: "Everywhere",
+      label: "Redo",
+      run: () => store.redo().catch(toastError),
+      when: () => store.state.can_redo,
+    },
   ];
 }
 
 /** @param {ProjectStore} store */
 function tellTroubles(store) {
   store.on("conflict", ({ label, again }) =>
-    toast(`“${label}” was not saved: another window has changed this project. You now see its newer state.`, { tone: "warn", seconds: 0, action: { label: "Do it again", run: again } }),
+    toast(`“${label}” was not saved: another window has changed this project. You now see its newer state.`, {
+      tone: "warn",
+      seconds: 0,
+      action: { label: "Do it again", run: again },
+    }),
   );
   store.on("refused", ({ label, error }) => toast(`“${label}” was not saved. ${sentence(error)}`, { tone: "bad" }));
 }
@@ -66,6 +83,12 @@ function tellTroubles(store) {
 /** @param {string} message */
 function showDeadEnd(message) {
   fill(find("#header"), h("a", { class: "brand", href: "/" }, "Rooftrack"));
-  const box = h("div", { class: "empty-state" }, h("h1", {}, "This project cannot be opened"), h("p", {}, message), h("a", { class: "button primary", href: "/" }, "All projects"));
+  const box = h(
+    "div",
+    { class: "empty-state" },
+    h("h1", {}, "This project cannot be opened"),
+    h("p", {}, message),
+    h("a", { class: "button primary", href: "/" }, "All projects"),
+  );
   fill(find("#main"), h("div", { class: "page" }, box));
 }

@@ -16,8 +16,17 @@ export function paneChrome(pane, { title, readout }) {
   const hint = h("span", { class: "pane-chip attention", hidden: true, role: "status" });
   const place = h("div", { class: "pane-readout", "aria-hidden": "true" });
   const note = h("div", { class: "pane-note", hidden: true });
-  const tool = (/** @type {import("../lib/icons.js").IconName} */ glyph, /** @type {string} */ words, /** @type {() => void} */ run) => h("button", { type: "button", "aria-label": words, title: words, onclick: run }, icon(glyph));
-  const tools = h("div", { class: "pane-tools" }, tool("zoom_in", "Zoom in (+)", () => pane.zoom(1.6)), tool("fit", "Whole picture (0)", () => pane.fit()));
+  const tool = (
+    /** @type {import("../lib/icons.js").IconName} */ glyph,
+    /** @type {string} */ words,
+    /** @type {() => void} */ run,
+  ) => h("button", { type: "button", "aria-label": words, title: words, onclick: run }, icon(glyph));
+  const tools = h(
+    "div",
+    { class: "pane-tools" },
+    tool("zoom_in", "Zoom in (+)", () => pane.zoom(1.6)),
+    tool("fit", "Whole picture (0)", () => pane.fit()),
+  );
   pane.element.append(h("div", { class: "pane-caption" }, name, hint), place, tools, note);
 
   const show = () => {

@@ -9,7 +9,10 @@ const DIRECTIONS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], A
 const PAN_STEP_PX = 40;
 
 /** @param {string} prefix "Shift+" or "Alt+" */
-const arrowsWith = (prefix) => ARROWS.split(" / ").map((key) => prefix + key).join(" / ");
+const arrowsWith = (prefix) =>
+  ARROWS.split(" / ")
+    .map((key) => prefix + key)
+    .join(" / ");
 
 /** Direction of an arrow key: u right, v down. @param {KeyboardEvent} event */
 export const arrowDirection = (event) => DIRECTIONS[event.key];
@@ -28,10 +31,22 @@ export function paneKeys(panes, { canPan = () => true } = {}) {
     focused()?.pan(-u * PAN_STEP_PX, -v * PAN_STEP_PX);
   };
   return [
-    { keys: "+ / =", group: "Looking", label: "Zoom in (or turn the wheel, at the pointer)", run: () => focused()?.zoom(1.4), when: has },
+    {
+      keys: "+ / =",
+      group: "Looking",
+      label: "Zoom in (or turn the wheel, at the pointer)",
+      run: () => focused()?.zoom(1.4),
+      when: has,
+    },
     { keys: "-", group: "Looking", label: "Zoom out", run: () => focused()?.zoom(1 / 1.4), when: has },
     { keys: "0", group: "Looking", label: "Whole picture", run: () => focused()?.fit(), when: has },
-    { keys: "1", group: "Looking", label: "One to one", run: () => focused()?.lookAt(/** @type {Pane} */ (focused()).centre, 1 / window.devicePixelRatio), when: has },
+    {
+      keys: "1",
+      group: "Looking",
+      label: "One to one",
+      run: () => focused()?.lookAt(/** @type {Pane} */ (focused()).centre, 1 / window.devicePixelRatio),
+      when: has,
+    },
     { keys: ARROWS, group: "Looking", label: "Pan (or drag)", run: pan, when: () => has() && canPan() },
   ];
 }

@@ -96,7 +96,8 @@ export class Pane extends Emitter {
 
   /** Show a picture; the view stays when it has the size of the one before. @param {PaneImage | null} image */
   setImage(image) {
-    const same = this.image !== null && image !== null && this.image.width === image.width && this.image.height === image.height;
+    const same =
+      this.image !== null && image !== null && this.image.width === image.width && this.image.height === image.height;
     this.image = image;
     this.element.dataset.picture = image === null ? "" : `${image.width}x${image.height}`;
     if (image !== null && !same) this.fit();

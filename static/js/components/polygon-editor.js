@@ -58,14 +58,44 @@ export class PolygonEditor extends Emitter {
     this.polygons.forEach((corners, i) => {
       const isSelected = this.selected?.polygon === i;
       shapes.push({ id: `${prefix}:edge:${i}`, kind: "polygon", class: look, points: corners });
-      shapes.push({ id: `${prefix}:outline:${i}`, kind: "polyline", class: `${look} ${isSelected ? "hot" : ""}`, points: [...corners, corners[0]], grab: true });
-      if (isSelected) corners.forEach((corner, j) => shapes.push({ id: `${prefix}:middle:${i}:${j}`, kind: "handle", class: `${look} faint`, points: [middle(corner, corners[(j + 1) % corners.length])], grab: true }));
-      corners.forEach((corner, j) => shapes.push({ id: `${prefix}:corner:${i}:${j}`, kind: "handle", class: `${look} ${isSelected && this.selected?.corner === j ? "selected" : ""}`, points: [corner], grab: true }));
+      shapes.push({
+        id: `${prefix}:outline:${i}`,
+        kind: "polyline",
+        class: `${look} ${isSelected ? "hot" : ""}`,
+        points: [...corners, corners[0]],
+        grab: true,
+      });
+      if (isSelected)
+        corners.forEach((corner, j) =>
+          shapes.push({
+            id: `${prefix}:middle:${i}:${j}`,
+            kind: "handle",
+            class: `${look} faint`,
+            points: [middle(corner, corners[(j + 1) % corners.length])],
+            grab: true,
+          }),
+        );
+      corners.forEach((corner, j) =>
+        shapes.push({
+          id: `${prefix}:corner:${i}:${j}`,
+          kind: "handle",
+          class: `${look} ${isSelected && this.selected?.corner === j ? "selected" : ""}`,
+          points: [corner],
+          grab: true,
+        }),
+      );
     });
     if (this.isDrawing) {
       const cursor = this.pane.cursor;
-      shapes.push({ id: `${prefix}:draft`, kind: "polyline", class: `${look} dashed`, points: cursor === null ? this.draft : [...this.draft, cursor] });
-      this.draft.forEach((corner, j) => shapes.push({ id: `${prefix}:placed:${j}`, kind: "handle", class: look, points: [corner], grab: true }));
+      shapes.push({
+        id: `${prefix}:draft`,
+        kind: "polyline",
+        class: `${look} dashed`,
+        points: cursor === null ? this.draft : [...this.draft, cursor],
+      });
+      this.draft.forEach((corner, j) =>
+        shapes.push({ id: `${prefix}:placed:${j}`, kind: "handle", class: look, points: [corner], grab: true }),
+      );
     }
     return shapes;
   }
@@ -99,7 +129,13 @@ export class PolygonEditor extends Emitter {
   nudge(delta) {
     if (this.selected === null) return;
     const { polygon, corner } = this.selected;
-    const polygons = this.options.polygons().map((corners, i) => (i === polygon ? corners.map((point, j) => (corner === null || corner === j ? add(point, delta) : point)) : corners));
+    const polygons = this.options
+      .polygons()
+      .map((corners, i) =>
+        i === polygon
+          ? corners.map((point, j) => (corner === null || corner === j ? add(point, delta) : point))
+          : corners,
+      );
     this.options.save(`Nudge ${this.options.noun}`, polygons, true);
   }
 
@@ -110,7 +146,11 @@ export class PolygonEditor extends Emitter {
     const corners = this.options.polygons()[polygon] ?? [];
     const rest = corner !== null && corners.length > 3 ? [corners.filter((_, j) => j !== corner)] : [];
     this.selected = rest.length > 0 ? { polygon, corner: null } : null;
-    this.options.save(`Delete ${corner === null ? this.options.noun : `corner of ${this.options.noun}`}`, this.options.polygons().toSpliced(polygon, 1, ...rest), false);
+    this.options.save(
+      `Delete ${corner === null ? this.options.noun : `corner of ${this.options.noun}`}`,
+      this.options.polygons().toSpliced(polygon, 1, ...rest),
+      false,
+    );
   }
 
   /** @param {number} polygon */
@@ -142,7 +182,11 @@ export class PolygonEditor extends Emitter {
       return this.emit("change", null);
     }
     const stored = this.options.polygons();
-    if (part === "outline") this.#live = stored.with(i, stored[i].map((corner) => add(corner, [point[0] - stored[i][0][0], point[1] - stored[i][0][1]])));
+    if (part === "outline")
+      this.#live = stored.with(
+        i,
+        stored[i].map((corner) => add(corner, [point[0] - stored[i][0][0], point[1] - stored[i][0][1]])),
+      );
     if (part === "corner") this.#live = stored.with(i, stored[i].with(j, point));
     if (part === "middle") this.#live = stored.with(i, stored[i].toSpliced(j + 1, 0, point));
     this.selected = { polygon: i, corner: part === "corner" ? j : part === "middle" ? j + 1 : null };

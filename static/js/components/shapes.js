@@ -70,7 +70,8 @@ export class ShapeLayer {
       halo.setAttribute("d", shape.kind === "mark" ? MARK : HANDLE);
       ink.setAttribute("d", shape.kind === "mark" ? MARK : HANDLE_CORE);
     } else {
-      const path = shape.kind === "arrow" ? arrowPath(canvas[0], canvas[1]) : linePath(canvas, shape.kind === "polygon");
+      const path =
+        shape.kind === "arrow" ? arrowPath(canvas[0], canvas[1]) : linePath(canvas, shape.kind === "polygon");
       halo.setAttribute("d", path);
       ink.setAttribute("d", path);
     }
@@ -86,7 +87,11 @@ export function shapeAt(shapes, view, canvas) {
   for (const shape of shapes) {
     if (!shape.grab) continue;
     const found = reach(shape, view, canvas);
-    if (found !== null && (best === null || found.rank < best.rank || (found.rank === best.rank && found.distance <= best.distance))) best = { shape, ...found };
+    if (
+      found !== null &&
+      (best === null || found.rank < best.rank || (found.rank === best.rank && found.distance <= best.distance))
+    )
+      best = { shape, ...found };
   }
   return best?.shape ?? null;
 }
@@ -106,12 +111,14 @@ function reach(shape, view, pointer) {
 }
 
 /** @param {Point[]} points @param {boolean} closed */
-const linePath = (points, closed) => (points.length === 0 ? "" : `M${points.map((point) => point.join(" ")).join("L")}${closed ? "Z" : ""}`);
+const linePath = (points, closed) =>
+  points.length === 0 ? "" : `M${points.map((point) => point.join(" ")).join("L")}${closed ? "Z" : ""}`;
 
 /** @param {Point} tail @param {Point} head */
 function arrowPath(tail, head) {
   const along = Math.atan2(head[1] - tail[1], head[0] - tail[0]);
-  const barb = (/** @type {number} */ turn) => [head[0] - 7 * Math.cos(along + turn), head[1] - 7 * Math.sin(along + turn)].join(" ");
+  const barb = (/** @type {number} */ turn) =>
+    [head[0] - 7 * Math.cos(along + turn), head[1] - 7 * Math.sin(along + turn)].join(" ");
   const barbs = distance(tail, head) > 9 ? `M${barb(0.5)}L${head.join(" ")}L${barb(-0.5)}` : "";
   return `M${tail.join(" ")}L${head.join(" ")}${barbs}`;
 }

@@ -50,25 +50,49 @@ export function sortableTable({ label, columns, id, onSelect, onOpen, rowClass, 
     show();
   };
   const show = () => {
-    const focused = document.activeElement instanceof HTMLTableRowElement && body.contains(document.activeElement) ? document.activeElement.dataset.id : null;
-    fill(head, columns.map((column) => heading(column, order, toggle)));
+    const focused =
+      document.activeElement instanceof HTMLTableRowElement && body.contains(document.activeElement)
+        ? document.activeElement.dataset.id
+        : null;
+    fill(
+      head,
+      columns.map((column) => heading(column, order, toggle)),
+    );
     if (rows.length === 0) return fill(body, h("tr", { class: "empty" }, h("td", { colspan: columns.length }, empty)));
-    fill(body, sorted().map((row) => tableRow(row)));
-    if (focused) /** @type {HTMLElement | null} */ (body.querySelector(`tr[data-id="${CSS.escape(focused)}"]`))?.focus();
+    fill(
+      body,
+      sorted().map((row) => tableRow(row)),
+    );
+    if (focused)
+      /** @type {HTMLElement | null} */ (body.querySelector(`tr[data-id="${CSS.escape(focused)}"]`))?.focus();
   };
   const tableRow = (/** @type {Row} */ row) => {
     const key = id(row);
-    const cells = columns.map((column) => h("td", { class: `${column.number ? "number" : ""} ${column.tone?.(row) ?? ""}` }, column.cell(row)));
+    const cells = columns.map((column) =>
+      h("td", { class: `${column.number ? "number" : ""} ${column.tone?.(row) ?? ""}` }, column.cell(row)),
+    );
     return h(
       "tr",
-      { "data-id": key, tabindex: 0, class: rowClass?.(row) ?? "", "aria-selected": key === selected ? "true" : "false", onclick: () => onSelect?.(row), ondblclick: () => onOpen?.(row) },
+      {
+        "data-id": key,
+        tabindex: 0,
+        class: rowClass?.(row) ?? "",
+        "aria-selected": key === selected ? "true" : "false",
+        onclick: () => onSelect?.(row),
+        ondblclick: () => onOpen?.(row),
+      },
       cells,
     );
   };
   body.addEventListener("keydown", (event) => {
     if (!(event.target instanceof HTMLTableRowElement)) return;
     const row = rows.find((entry) => id(entry) === /** @type {HTMLElement} */ (event.target).dataset.id);
-    const next = event.key === "ArrowDown" ? event.target.nextElementSibling : event.key === "ArrowUp" ? event.target.previousElementSibling : null;
+    const next =
+      event.key === "ArrowDown"
+        ? event.target.nextElementSibling
+        : event.key === "ArrowUp"
+          ? event.target.previousElementSibling
+          : null;
     if (next instanceof HTMLElement) {
       event.preventDefault();
       next.focus();
@@ -105,7 +129,13 @@ export function sortableTable({ label, columns, id, onSelect, onOpen, rowClass, 
 function heading(column, order, toggle) {
   const direction = order?.key === column.key ? (order.down ? "descending" : "ascending") : null;
   const arrow = direction === null ? "" : direction === "descending" ? " ↓" : " ↑";
-  const content = column.sort ? h("button", { type: "button", title: column.hint ?? null, onclick: () => toggle(column.key) }, column.title + arrow) : h("span", { title: column.hint ?? null }, column.title);
+  const content = column.sort
+    ? h(
+        "button",
+        { type: "button", title: column.hint ?? null, onclick: () => toggle(column.key) },
+        column.title + arrow,
+      )
+    : h("span", { title: column.hint ?? null }, column.title);
   return h("th", { scope: "col", class: column.number ? "number" : "", "aria-sort": direction }, content);
 }
 

@@ -24,8 +24,13 @@ export function toast(message, { tone = "info", action, seconds = tone === "bad"
     { class: `toast ${tone}`, role: tone === "bad" || tone === "warn" ? "alert" : "status" },
     icon(ICONS[tone]),
     h("p", {}, message),
-    action && h("button", { class: "button small", type: "button", onclick: () => (close(), action.run()) }, action.label),
-    h("button", { class: "button quiet small icon-only", type: "button", "aria-label": "Dismiss", onclick: close }, icon("close", "small")),
+    action &&
+      h("button", { class: "button small", type: "button", onclick: () => (close(), action.run()) }, action.label),
+    h(
+      "button",
+      { class: "button quiet small icon-only", type: "button", "aria-label": "Dismiss", onclick: close },
+      icon("close", "small"),
+    ),
   );
   tray.append(element);
   while (tray.children.length > 4) tray.firstElementChild?.remove();

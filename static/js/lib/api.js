@@ -86,7 +86,8 @@ export function upload(method, path, file, onProgress, signal) {
         reject(error);
       }
     };
-    transfer.onerror = () => reject(new ApiError(0, { message: "The upload broke off; nothing was kept. Try again.", kind: "offline" }));
+    transfer.onerror = () =>
+      reject(new ApiError(0, { message: "The upload broke off; nothing was kept. Try again.", kind: "offline" }));
     transfer.onabort = () => reject(new DOMException("cancelled", "AbortError"));
     signal?.addEventListener("abort", () => transfer.abort());
     transfer.send(file);

@@ -17,7 +17,17 @@ import { projectPath } from "./api.js";
  * @property {any} scene
  */
 
-const NAMES = /** @type {const} */ (["hello", "job", "project", "inputs", "orthoimage", "results", "track", "pick", "scene"]);
+const NAMES = /** @type {const} */ ([
+  "hello",
+  "job",
+  "project",
+  "inputs",
+  "orthoimage",
+  "results",
+  "track",
+  "pick",
+  "scene",
+]);
 
 /** @extends {Emitter<ServerEvents>} */
 export class ServerEventStream extends Emitter {
@@ -38,7 +48,9 @@ export class ServerEventStream extends Emitter {
     if (this.#source !== null) return;
     this.#source = new EventSource(this.url);
     for (const name of NAMES) {
-      this.#source.addEventListener(name, (event) => this.emit(name, JSON.parse(/** @type {MessageEvent} */ (event).data)));
+      this.#source.addEventListener(name, (event) =>
+        this.emit(name, JSON.parse(/** @type {MessageEvent} */ (event).data)),
+      );
     }
   }
 

@@ -19,12 +19,15 @@ export const millimetres = (value_m, decimals = 1) => withUnit(fixed(scaled(valu
 /** @param {number | null | undefined} value_px @param {number} [decimals] */
 export const pixels = (value_px, decimals = 2) => withUnit(fixed(value_px, decimals), "px");
 /** @param {number | null | undefined} value_deg @param {number} [decimals] */
-export const degrees = (value_deg, decimals = 1) => (fixed(value_deg, decimals) === DASH ? DASH : `${fixed(value_deg, decimals)}°`);
+export const degrees = (value_deg, decimals = 1) =>
+  fixed(value_deg, decimals) === DASH ? DASH : `${fixed(value_deg, decimals)}°`;
 
 /** Thousands apart: 12 345 678. @param {number | null | undefined} value */
 export function count(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return DASH;
-  return Math.round(value).toString().replace(/\B(?=(\d{3})+$)/g, "\u202f");
+  return Math.round(value)
+    .toString()
+    .replace(/\B(?=(\d{3})+$)/g, "\u202f");
 }
 
 /** Bytes as kB, MB, GB. @param {number | null | undefined} bytes */

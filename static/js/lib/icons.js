@@ -49,5 +49,9 @@ const PATHS = {
 
 /** @param {IconName} name @param {string} [extra] more classes */
 export function icon(name, extra = "") {
-  return svg("svg", { class: `icon ${extra}`, viewBox: "0 0 16 16", "aria-hidden": "true" }, svg("path", { d: PATHS[name] }));
+  return svg(
+    "svg",
+    { class: `icon ${extra}`, viewBox: "0 0 16 16", "aria-hidden": "true" },
+    svg("path", { d: PATHS[name] }),
+  );
 }

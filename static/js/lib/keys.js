@@ -48,7 +48,11 @@ function isTyping(target) {
 
 /** Whether this element uses the key itself. @param {EventTarget | null} target @param {string} name */
 function isOwnKey(target, name) {
-  return (name === "Enter" || name === "Space") && target instanceof Element && target.closest("button, a, summary, [role=menuitem]") !== null;
+  return (
+    (name === "Enter" || name === "Space") &&
+    target instanceof Element &&
+    target.closest("button, a, summary, [role=menuitem]") !== null
+  );
 }
 
 document.addEventListener("keydown", (event) => {
@@ -57,7 +61,8 @@ document.addEventListener("keydown", (event) => {
   const typing = isTyping(event.target);
   if (isOwnKey(event.target, name)) return;
   const binding = table.findLast(
-    (entry) => entry.run && entry.keys.split(" / ").includes(name) && (!typing || entry.inFields) && (entry.when?.() ?? true),
+    (entry) =>
+      entry.run && entry.keys.split(" / ").includes(name) && (!typing || entry.inFields) && (entry.when?.() ?? true),
   );
   if (!binding?.run) return;
   event.preventDefault();

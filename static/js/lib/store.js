@@ -118,7 +118,8 @@ export class ProjectStore extends Emitter {
     } catch (error) {
       this.#waiting = [];
       await this.#reload();
-      if (error instanceof ApiError && error.status === 409) this.emit("conflict", { label, again: () => void this.edit(label, change) });
+      if (error instanceof ApiError && error.status === 409)
+        this.emit("conflict", { label, again: () => void this.edit(label, change) });
       else this.emit("refused", { label, error });
     }
   }

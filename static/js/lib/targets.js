@@ -56,7 +56,16 @@ export class Targets extends Emitter {
     const taken = new Set(this.all.map((target) => target.name));
     const names = ["roof", "table", ...Array.from({ length: 98 }, (_, i) => `target-${i + 3}`)];
     const name = names.find((candidate) => !taken.has(candidate)) ?? `target-${Date.now()}`;
-    const target = { name, kind, height_m: null, p1_p2_m: null, lines: null, region_m: null, relative_to: null, ...known };
+    const target = {
+      name,
+      kind,
+      height_m: null,
+      p1_p2_m: null,
+      lines: null,
+      region_m: null,
+      relative_to: null,
+      ...known,
+    };
     this.#selected = name;
     this.#keepOpen([...this.#open, target]);
     return target;
@@ -71,7 +80,9 @@ export class Targets extends Emitter {
    */
   change(name, label, change, { merge = false } = {}) {
     if (this.store.project.targets.some((target) => target.name === name)) {
-      void this.store.edit(label, (draft) => draft.targets.filter((target) => target.name === name).forEach(change), { merge });
+      void this.store.edit(label, (draft) => draft.targets.filter((target) => target.name === name).forEach(change), {
+        merge,
+      });
       return;
     }
     const open = structuredClone(this.#open);
@@ -98,7 +109,8 @@ export class Targets extends Emitter {
 
   /** @param {string} name */
   remove(name) {
-    if (!this.store.project.targets.some((target) => target.name === name)) return this.#keepOpen(this.#open.filter((target) => target.name !== name));
+    if (!this.store.project.targets.some((target) => target.name === name))
+      return this.#keepOpen(this.#open.filter((target) => target.name !== name));
     void this.store.edit(`Delete target ${name}`, (draft) => {
       draft.targets = draft.targets.filter((target) => target.name !== name);
       for (const target of draft.targets) if (target.relative_to === name) target.relative_to = null;

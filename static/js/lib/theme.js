@@ -13,7 +13,9 @@ const listeners = new Set();
 /** For what is drawn on a canvas and cannot follow the style sheet. @param {() => void} listener */
 export const onTheme = (listener) => listeners.add(listener);
 
-window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => listeners.forEach((listener) => listener()));
+window
+  .matchMedia("(prefers-color-scheme: dark)")
+  .addEventListener("change", () => listeners.forEach((listener) => listener()));
 
 export function nextTheme() {
   const theme = isDark() ? "light" : "dark";

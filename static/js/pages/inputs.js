@@ -20,19 +20,55 @@ const { store } = page;
 /** @param {Project} draft @param {InputKind} kind @param {string | null} path */
 function setInput(draft, kind, path) {
   if (kind === "video") draft.inputs.video = path ?? "";
-  else if (kind === "gps") draft.inputs.gps = path === null ? null : { time: "time_s", x: "east_m", y: "north_m", at_m: null, ...draft.inputs.gps, file: path };
+  else if (kind === "gps")
+    draft.inputs.gps =
+      path === null ? null : { time: "time_s", x: "east_m", y: "north_m", at_m: null, ...draft.inputs.gps, file: path };
   else draft.inputs[kind] = path;
 }
 
 const KINDS = /** @type {const} */ ([
-  { kind: "video", title: "Video", glyph: "video", accept: "video/*", why: "A drone video of the structure from above, ground around it in view." },
-  { kind: "cloud", title: "Point cloud", glyph: "cube", accept: ".las,.laz,.ply,.pcd,.xyz,.pts,.csv,.e57", why: "A LiDAR cloud of the site: it ties the picture to metres and gives the roof's height." },
-  { kind: "lens", title: "Lens", glyph: "target", accept: ".yaml,.yml,.xml", why: "Interior orientation of the camera. Calibrate it here from pictures of a checkerboard." },
-  { kind: "gps", title: "GPS", glyph: "clock", accept: ".csv", why: "Optional: a GPS record on the roof, to compare the result with." },
+  {
+    kind: "video",
+    title: "Video",
+    glyph: "video",
+    accept: "video/*",
+    why: "A drone video of the structure from above, ground around it in view.",
+  },
+  {
+    kind: "cloud",
+    title: "Point cloud",
+    glyph: "cube",
+    accept: ".las,.laz,.ply,.pcd,.xyz,.pts,.csv,.e57",
+    why: "A LiDAR cloud of the site: it ties the picture to metres and gives the roof's height.",
+  },
+  {
+    kind: "lens",
+    title: "Lens",
+    glyph: "target",
+    accept: ".yaml,.yml,.xml",
+    why: "Interior orientation of the camera. Calibrate it here from pictures of a checkerboard.",
+  },
+  {
+    kind: "gps",
+    title: "GPS",
+    glyph: "clock",
+    accept: ".csv",
+    why: "Optional: a GPS record on the roof, to compare the result with.",
+  },
 ]);
 
-const calibrate = h("button", { class: "button small", type: "button", onclick: () => void calibrationDialog(page.id).catch(toastError) }, icon("target", "small"), "Calibrate…");
-const columns = h("button", { class: "button small", type: "button", onclick: () => void gpsSettings(store).catch(toastError) }, icon("edit", "small"), "Columns…");
+const calibrate = h(
+  "button",
+  { class: "button small", type: "button", onclick: () => void calibrationDialog(page.id).catch(toastError) },
+  icon("target", "small"),
+  "Calibrate…",
+);
+const columns = h(
+  "button",
+  { class: "button small", type: "button", onclick: () => void gpsSettings(store).catch(toastError) },
+  icon("edit", "small"),
+  "Columns…",
+);
 /** @type {Partial<Record<InputKind, Node[]>>} */
 const FURTHER = { lens: [calibrate], gps: [columns] };
 const cards = new Map(
@@ -43,7 +79,10 @@ const cards = new Map(
       projectId: page.id,
       onPath: (path) => store.edit(`Choose ${entry.title.toLowerCase()}`, (draft) => setInput(draft, entry.kind, path)),
       onChange: () => void store.refresh().catch(toastError),
-      onRemove: entry.kind === "video" ? null : () => store.edit(`Remove ${entry.title.toLowerCase()}`, (draft) => setInput(draft, entry.kind, null)),
+      onRemove:
+        entry.kind === "video"
+          ? null
+          : () => store.edit(`Remove ${entry.title.toLowerCase()}`, (draft) => setInput(draft, entry.kind, null)),
       more: FURTHER[entry.kind],
     }),
   ]),
@@ -51,12 +90,35 @@ const cards = new Map(
 const job = jobCard();
 const report = calibrationReport(page.id);
 const problems = h("div", { class: "problems" });
-const next = h("a", { class: "button primary", href: stepUrl(page.id, "orthoimage") }, "Orthoimage & 3D", icon("arrow_right", "small"));
+const next = h(
+  "a",
+  { class: "button primary", href: stepUrl(page.id, "orthoimage") },
+  "Orthoimage & 3D",
+  icon("arrow_right", "small"),
+);
 fill(
   find("#main"),
-  h("div", { class: "page-title" }, h("div", {}, h("h1", {}, "Inputs"), h("p", {}, "Choose files on this computer, or drop and send them from anywhere. Each is read at once; what was understood stands beside it.")), next),
+  h(
+    "div",
+    { class: "page-title" },
+    h(
+      "div",
+      {},
+      h("h1", {}, "Inputs"),
+      h(
+        "p",
+        {},
+        "Choose files on this computer, or drop and send them from anywhere. Each is read at once; what was understood stands beside it.",
+      ),
+    ),
+    next,
+  ),
   problems,
-  h("div", { class: "card-grid" }, [...cards.values()].map((card) => card.element)),
+  h(
+    "div",
+    { class: "card-grid" },
+    [...cards.values()].map((card) => card.element),
+  ),
   job.element,
   report.element,
 );
@@ -74,7 +136,10 @@ async function load() {
 /** Only what concerns the files themselves: later steps tell their own. */
 function showProblems() {
   const own = (store.state.problems ?? []).filter((problem) => problem.startsWith("inputs"));
-  fill(problems, own.map((problem) => h("p", { class: "note warn" }, icon("warn"), h("span", {}, problem))));
+  fill(
+    problems,
+    own.map((problem) => h("p", { class: "note warn" }, icon("warn"), h("span", {}, problem))),
+  );
 }
 
 /** @param {import("../lib/types.js").Job | null} running */

@@ -40,13 +40,28 @@ let picked = null;
 
 // --- stage
 
-const pane = new Pane(find("#picture"), { label: "Orthoimage. A click, or Enter in the middle, reads the height there." });
-const chrome = paneChrome(pane, { title: "Orthoimage", readout: (point) => (grid === null ? [] : [`${worldFromOrtho(grid, point).map((value) => fixed(value, 2)).join(", ")} m`]) });
+const pane = new Pane(find("#picture"), {
+  label: "Orthoimage. A click, or Enter in the middle, reads the height there.",
+});
+const chrome = paneChrome(pane, {
+  title: "Orthoimage",
+  readout: (point) =>
+    grid === null
+      ? []
+      : [
+          `${worldFromOrtho(grid, point)
+            .map((value) => fixed(value, 2))
+            .join(", ")} m`,
+        ],
+});
 const sceneNote = h("div", { class: "pane-note", hidden: true, role: "status" });
 find("#scene").append(sceneNote);
 const tabs = segmented({
   label: "View",
-  choices: /** @type {{value: Tab, name: string}[]} */ ([{ value: "scene", name: "3D" }, { value: "picture", name: "Orthoimage" }]),
+  choices: /** @type {{value: Tab, name: string}[]} */ ([
+    { value: "scene", name: "3D" },
+    { value: "picture", name: "Orthoimage" },
+  ]),
   value: viewText("view") === "picture" ? "picture" : "scene",
   onChange: showTab,
 });
@@ -62,7 +77,10 @@ function showTab(tab) {
 }
 
 function openScene() {
-  if (find("#scene").querySelector("iframe") === null) find("#scene").prepend(h("iframe", { class: "scene-frame", title: "3D scene of the point cloud", src: "/viser/?hideViserLogo" }));
+  if (find("#scene").querySelector("iframe") === null)
+    find("#scene").prepend(
+      h("iframe", { class: "scene-frame", title: "3D scene of the point cloud", src: "/viser/?hideViserLogo" }),
+    );
   scene.send();
 }
 
@@ -74,7 +92,9 @@ function tellScene(message) {
 
 // --- heights
 
-const heights = heightPanel(find("#height"), targets, (name) => toast(`${name} stands at this height now.`, { tone: "good" }));
+const heights = heightPanel(find("#height"), targets, (name) =>
+  toast(`${name} stands at this height now.`, { tone: "good" }),
+);
 
 pane.on("click", async ({ point }) => {
   if (grid === null) return;
@@ -88,7 +108,8 @@ pane.on("click", async ({ point }) => {
   }
 });
 page.events.on("pick", ({ xyz_m, height_m, spread_m, points, message }) => {
-  if (xyz_m && height_m !== undefined) heights.show({ place_m: xyz_m, height_m, spread_m: spread_m ?? 0, points: points ?? 0 });
+  if (xyz_m && height_m !== undefined)
+    heights.show({ place_m: xyz_m, height_m, spread_m: spread_m ?? 0, points: points ?? 0 });
   else heights.refuse(message ?? "The click met nothing of the cloud.");
 });
 
@@ -119,19 +140,49 @@ const pixelSize = numberField({
   step: 0.5,
   min: 0.1,
   max: 100,
-  onChange: (value) => value !== null && void store.edit("Pixel size of the orthoimage", (draft) => void (draft.orthoimage.pixel_size_m = value / 100)),
+  onChange: (value) =>
+    value !== null &&
+    void store.edit("Pixel size of the orthoimage", (draft) => void (draft.orthoimage.pixel_size_m = value / 100)),
 });
-const extent = extentFields((wanted) => void store.edit("Extent of the orthoimage", (draft) => void (draft.orthoimage.extent_m = wanted)));
-const whole = h("button", { class: "button small", type: "button", onclick: () => void store.edit("Whole cloud as extent", (draft) => void (draft.orthoimage.extent_m = null)) }, "Whole cloud");
-const inView = h("button", { class: "button small", type: "button", title: "The part of the ground now in the orthoimage's view", onclick: takeView }, "What is in view");
-const make = h("button", { class: "button primary", type: "button", onclick: () => void start() }, "Make the orthoimage");
+const extent = extentFields(
+  (wanted) => void store.edit("Extent of the orthoimage", (draft) => void (draft.orthoimage.extent_m = wanted)),
+);
+const whole = h(
+  "button",
+  {
+    class: "button small",
+    type: "button",
+    onclick: () => void store.edit("Whole cloud as extent", (draft) => void (draft.orthoimage.extent_m = null)),
+  },
+  "Whole cloud",
+);
+const inView = h(
+  "button",
+  {
+    class: "button small",
+    type: "button",
+    title: "The part of the ground now in the orthoimage's view",
+    onclick: takeView,
+  },
+  "What is in view",
+);
+const make = h(
+  "button",
+  { class: "button primary", type: "button", onclick: () => void start() },
+  "Make the orthoimage",
+);
 const facts = h("div", { class: "settings" });
 const job = jobCard();
 fill(
   find("#raster"),
   h("header", {}, h("h2", {}, "Orthoimage"), h("span", { class: "badge", id: "raster-state" })),
   pixelSize.element,
-  h("div", { class: "field" }, h("div", { class: "section-head" }, h("span", { class: "label spring" }, "Extent"), whole, inView), extent.element),
+  h(
+    "div",
+    { class: "field" },
+    h("div", { class: "section-head" }, h("span", { class: "label spring" }, "Extent"), whole, inView),
+    extent.element,
+  ),
   make,
   job.element,
   facts,
@@ -172,7 +223,12 @@ function showSettings() {
 }
 
 /** Outer edges of a raster. @param {OrthoGrid} raster @returns {Extent} */
-const extentOf = (raster) => [raster.west_m, raster.north_m - raster.height * raster.pixel_size_m, raster.west_m + raster.width * raster.pixel_size_m, raster.north_m];
+const extentOf = (raster) => [
+  raster.west_m,
+  raster.north_m - raster.height * raster.pixel_size_m,
+  raster.west_m + raster.width * raster.pixel_size_m,
+  raster.north_m,
+];
 
 // --- what the server has
 
@@ -181,14 +237,22 @@ let loaded = "";
 
 async function load() {
   try {
-    const [answer, inputs] = await Promise.all([get(projectPath(page.id, "orthoimage")), get(projectPath(page.id, "inputs"))]);
+    const [answer, inputs] = await Promise.all([
+      get(projectPath(page.id, "orthoimage")),
+      get(projectPath(page.id, "inputs")),
+    ]);
     grid = answer.grid;
     showGround(inputs.cloud);
     showRaster(answer);
     showSettings();
     if (answer.job) showJob(answer.job);
     if (answer.ready) await showPicture(answer);
-    else chrome.setNote(store.project.inputs.cloud === null ? "This project has no point cloud." : "There is no orthoimage yet: choose pixel and extent on the right, and make it.");
+    else
+      chrome.setNote(
+        store.project.inputs.cloud === null
+          ? "This project has no point cloud."
+          : "There is no orthoimage yet: choose pixel and extent on the right, and make it.",
+      );
   } catch (error) {
     chrome.setNote(sentence(error));
   }
@@ -206,13 +270,42 @@ async function showPicture(answer) {
 
 /** @param {Record<string, any> | null} cloud */
 function showGround(cloud) {
-  if (cloud === null) return fill(ground, note("info", "Without a point cloud, ground coordinates are typed beside each correspondence, and heights in Regions."));
+  if (cloud === null)
+    return fill(
+      ground,
+      note(
+        "info",
+        "Without a point cloud, ground coordinates are typed beside each correspondence, and heights in Regions.",
+      ),
+    );
   if (cloud.error) return fill(ground, note("bad", cloud.error.message));
-  if (cloud.reading || !cloud.ground) return fill(ground, h("p", { class: "soft" }, "The cloud is being read…"), h("progress", { "aria-label": "Reading the cloud" }));
+  if (cloud.reading || !cloud.ground)
+    return fill(
+      ground,
+      h("p", { class: "soft" }, "The cloud is being read…"),
+      h("progress", { "aria-label": "Reading the cloud" }),
+    );
   const { z_m, spread_m, tilt_deg } = cloud.ground;
-  const figure = (/** @type {string} */ value, /** @type {string} */ name) => h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
-  const verdict = spread_m < LARGE_SPREAD_M ? note("good", "Flat enough: less than 10 cm of spread.") : note("warn", "The ground is uneven by more than 10 cm: relief moves the picture where the camera looks aslant.");
-  fill(ground, h("div", { class: "figures" }, figure(metres(z_m), "level"), figure(millimetres(spread_m, 0), "spread"), figure(degrees(tilt_deg, 2), "tilt")), verdict);
+  const figure = (/** @type {string} */ value, /** @type {string} */ name) =>
+    h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
+  const verdict =
+    spread_m < LARGE_SPREAD_M
+      ? note("good", "Flat enough: less than 10 cm of spread.")
+      : note(
+          "warn",
+          "The ground is uneven by more than 10 cm: relief moves the picture where the camera looks aslant.",
+        );
+  fill(
+    ground,
+    h(
+      "div",
+      { class: "figures" },
+      figure(metres(z_m), "level"),
+      figure(millimetres(spread_m, 0), "spread"),
+      figure(degrees(tilt_deg, 2), "tilt"),
+    ),
+    verdict,
+  );
 }
 
 /** @param {{ready: boolean, stale: boolean, grid: OrthoGrid | null, measured_share: number | null, filled_share: number | null, notes: string[]}} answer */
@@ -225,10 +318,21 @@ function showRaster({ ready, stale, grid: raster, measured_share, filled_share, 
   if (raster === null || !ready) return fill(facts);
   const share = (/** @type {number | null} */ value) => `${fixed(100 * (value ?? 0), 0)} %`;
   const rows = [
-    ["Size", `${raster.width} × ${raster.height} px, ${metres(raster.width * raster.pixel_size_m, 1)} × ${metres(raster.height * raster.pixel_size_m, 1)}`],
+    [
+      "Size",
+      `${raster.width} × ${raster.height} px, ${metres(raster.width * raster.pixel_size_m, 1)} × ${metres(raster.height * raster.pixel_size_m, 1)}`,
+    ],
     ["Measured", `${share(measured_share)} of the pixels, ${share(filled_share)} filled from neighbours`],
   ];
-  fill(facts, h("dl", { class: "facts small" }, rows.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)])), notes.map((words) => note("info", words)));
+  fill(
+    facts,
+    h(
+      "dl",
+      { class: "facts small" },
+      rows.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]),
+    ),
+    notes.map((words) => note("info", words)),
+  );
 }
 
 // --- flow
@@ -236,7 +340,9 @@ function showRaster({ ready, stale, grid: raster, measured_share, filled_share, 
 let madeTimes = 0;
 store.on("change", ({ project, previous, origin }) => {
   showSettings();
-  const changed = JSON.stringify([project.orthoimage, project.inputs.cloud]) !== JSON.stringify([previous.orthoimage, previous.inputs.cloud]);
+  const changed =
+    JSON.stringify([project.orthoimage, project.inputs.cloud]) !==
+    JSON.stringify([previous.orthoimage, previous.inputs.cloud]);
   if (origin === "saved" || changed) void load();
 });
 page.events.on("job", showJob);
@@ -252,11 +358,29 @@ page.events.on("orthoimage", () => {
 });
 page.keys([
   { keys: "Click", group: "Heights", label: "Read the height of a place, in 3D or on the orthoimage" },
-  { keys: "Enter / Space", group: "Heights", label: "Read the height in the middle of the orthoimage (keyboard)", when: () => pane.hasFocus, run: (event) => pane.clickCentre(event) },
-  { keys: "T", group: "Looking", label: "3D or orthoimage", run: () => showTab(find("#scene").hidden ? "scene" : "picture") },
+  {
+    keys: "Enter / Space",
+    group: "Heights",
+    label: "Read the height in the middle of the orthoimage (keyboard)",
+    when: () => pane.hasFocus,
+    run: (event) => pane.clickCentre(event),
+  },
+  {
+    keys: "T",
+    group: "Looking",
+    label: "3D or orthoimage",
+    run: () => showTab(find("#scene").hidden ? "scene" : "picture"),
+  },
   ...paneKeys([pane]),
 ]);
-find("#next").append(h("a", { class: "button", href: `/p/${encodeURIComponent(page.id)}/correspondences` }, "Correspondences", icon("arrow_right", "small")));
+find("#next").append(
+  h(
+    "a",
+    { class: "button", href: `/p/${encodeURIComponent(page.id)}/correspondences` },
+    "Correspondences",
+    icon("arrow_right", "small"),
+  ),
+);
 showSettings();
 showTab(viewText("view") === "picture" ? "picture" : "scene");
 await load();

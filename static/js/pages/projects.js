@@ -16,13 +16,37 @@ import { newProjectDialog } from "./projects/new-project.js";
 /** @typedef {{id: string, name: string, updated_s: number, steps: Steps}} Listed */
 
 const list = h("div", { class: "project-list" });
-const create = h("button", { class: "button primary", type: "button", onclick: () => void newProject() }, icon("add"), "New project");
-const restore = h("button", { class: "button", type: "button", onclick: () => void restoreArchive() }, icon("upload"), "Restore archive…");
+const create = h(
+  "button",
+  { class: "button primary", type: "button", onclick: () => void newProject() },
+  icon("add"),
+  "New project",
+);
+const restore = h(
+  "button",
+  { class: "button", type: "button", onclick: () => void restoreArchive() },
+  icon("upload"),
+  "Restore archive…",
+);
 
 projectsHeader();
 fill(
   find("#main"),
-  h("div", { class: "page-title" }, h("div", {}, h("h1", {}, "Projects"), h("p", {}, "Displacement of a structure from a drone video: each project is a folder with its inputs, your decisions and the results.")), h("div", { class: "toolbar" }, restore, create)),
+  h(
+    "div",
+    { class: "page-title" },
+    h(
+      "div",
+      {},
+      h("h1", {}, "Projects"),
+      h(
+        "p",
+        {},
+        "Displacement of a structure from a drone video: each project is a folder with its inputs, your decisions and the results.",
+      ),
+    ),
+    h("div", { class: "toolbar" }, restore, create),
+  ),
   list,
 );
 bindKeys([{ keys: "C", group: "Projects", label: "New project", run: () => void newProject() }]);
@@ -42,14 +66,35 @@ function card(project) {
   const doneCount = STEPS.filter(({ step }) => ["done", "warn"].includes(project.steps[step].status)).length;
   const steps = STEPS.map(({ step, name }, i) => {
     const { status, message } = project.steps[step];
-    return h("li", {}, h("a", { href: stepUrl(project.id, step), title: `${name}: ${message}` }, statusMark(status, i + 1), h("span", { class: "name" }, name)));
+    return h(
+      "li",
+      {},
+      h(
+        "a",
+        { href: stepUrl(project.id, step), title: `${name}: ${message}` },
+        statusMark(status, i + 1),
+        h("span", { class: "name" }, name),
+      ),
+    );
   });
   const message = project.steps[next.step].message;
   return h(
     "article",
     { class: "card project-card", "data-project": project.id },
-    h("img", { class: "still", alt: "", loading: "lazy", src: `/api/${projectPath(project.id, "frames/0.jpg", { w: 360 })}`, onerror: (/** @type {Event} */ event) => /** @type {Element} */ (event.target).classList.add("missing") }),
-    h("header", {}, h("h2", {}, h("a", { href: `/p/${encodeURIComponent(project.id)}` }, project.name)), h("span", { class: "faint small" }, ago(project.updated_s)), actions(project)),
+    h("img", {
+      class: "still",
+      alt: "",
+      loading: "lazy",
+      src: `/api/${projectPath(project.id, "frames/0.jpg", { w: 360 })}`,
+      onerror: (/** @type {Event} */ event) => /** @type {Element} */ (event.target).classList.add("missing"),
+    }),
+    h(
+      "header",
+      {},
+      h("h2", {}, h("a", { href: `/p/${encodeURIComponent(project.id)}` }, project.name)),
+      h("span", { class: "faint small" }, ago(project.updated_s)),
+      actions(project),
+    ),
     h("ol", { class: "step-strip", "aria-label": "Steps" }, steps),
     h("p", { class: "small soft" }, doneCount === STEPS.length ? "All steps done." : `${next.name}: ${message}`),
   );
@@ -91,19 +136,31 @@ async function rename(project) {
   if (name === null || name === project.name) return;
   await attempt(async () => {
     const state = await get(projectPath(project.id));
-    await put(projectPath(project.id), { project: { ...state.project, name }, revision: state.revision, label: `Rename to ${name}` });
+    await put(projectPath(project.id), {
+      project: { ...state.project, name },
+      revision: state.revision,
+      label: `Rename to ${name}`,
+    });
   });
 }
 
 /** @param {Listed} project */
 async function duplicate(project) {
-  const name = await askText({ title: "Duplicate project", label: "Name of the copy", value: `${project.name} copy`, action: "Duplicate" });
+  const name = await askText({
+    title: "Duplicate project",
+    label: "Name of the copy",
+    value: `${project.name} copy`,
+    action: "Duplicate",
+  });
   if (name !== null) await attempt(() => post(projectPath(project.id, "duplicate"), { name }));
 }
 
 /** @param {Listed} project @param {boolean} inputs */
 function archive(project, inputs) {
-  h("a", { href: `/api/${projectPath(project.id, "archive", { inputs: inputs ? 1 : 0 })}`, download: `${project.id}.zip` }).click();
+  h("a", {
+    href: `/api/${projectPath(project.id, "archive", { inputs: inputs ? 1 : 0 })}`,
+    download: `${project.id}.zip`,
+  }).click();
 }
 
 /** @param {Listed} project */
@@ -121,7 +178,18 @@ async function restoreArchive() {
   const cancel = new AbortController();
   const bar = h("progress", { max: 1, value: 0, "aria-label": "Restoring" });
   const words = h("span", { class: "numbers number" });
-  const row = h("div", { class: "job" }, h("div", { class: "job-head" }, h("strong", {}, `Restoring ${file.name}`), words, h("button", { class: "button small", type: "button", onclick: () => cancel.abort() }, "Cancel")), bar);
+  const row = h(
+    "div",
+    { class: "job" },
+    h(
+      "div",
+      { class: "job-head" },
+      h("strong", {}, `Restoring ${file.name}`),
+      words,
+      h("button", { class: "button small", type: "button", onclick: () => cancel.abort() }, "Cancel"),
+    ),
+    bar,
+  );
   list.before(row);
   await attempt(async () => {
     const sent = (/** @type {number} */ done, /** @type {number} */ total) => {
@@ -141,8 +209,20 @@ function emptyState() {
     svg("path", { d: "M10 56h52M18 56V34l18-12 18 12v22M18 34h36M28 12h16M22 9h12M38 9h12" }),
     svg("path", { d: "M36 12 20 34M36 12l16 22", "stroke-dasharray": "3 3" }),
   );
-  const begin = h("button", { class: "button primary", type: "button", onclick: () => void newProject() }, icon("add"), "New project");
-  return h("div", { class: "empty-state" }, drawing, h("h2", {}, "No project yet"), h("p", {}, "Begin with a drone video of the structure; the point cloud, lens and GPS can follow."), begin);
+  const begin = h(
+    "button",
+    { class: "button primary", type: "button", onclick: () => void newProject() },
+    icon("add"),
+    "New project",
+  );
+  return h(
+    "div",
+    { class: "empty-state" },
+    drawing,
+    h("h2", {}, "No project yet"),
+    h("p", {}, "Begin with a drone video of the structure; the point cloud, lens and GPS can follow."),
+    begin,
+  );
 }
 
 void load();

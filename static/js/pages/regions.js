@@ -48,18 +48,31 @@ const same = (/** @type {Point} */ point) => point;
 // --- panes
 
 const framePane = new Pane(find("#frame"), { label: "Reference frame. Clicks draw the outline of what moves." });
-const planPane = new Pane(find("#plan"), { label: "Orthorectified reference frame. Clicks draw the search bands of the chosen target." });
+const planPane = new Pane(find("#plan"), {
+  label: "Orthorectified reference frame. Clicks draw the search bands of the chosen target.",
+});
 const panes = [framePane, planPane];
 const loupes = panes.map((pane) => new Loupe(pane));
-const frameChrome = paneChrome(framePane, { title: "Reference frame · raw", readout: ([u, v]) => [`${fixed(u, 1)}, ${fixed(v, 1)} px`] });
-const planChrome = paneChrome(planPane, { title: "Orthorectified frame", readout: (point) => [`${toPlan(point).map((value) => fixed(value, 2)).join(", ")} m`] });
+const frameChrome = paneChrome(framePane, {
+  title: "Reference frame · raw",
+  readout: ([u, v]) => [`${fixed(u, 1)}, ${fixed(v, 1)} px`],
+});
+const planChrome = paneChrome(planPane, {
+  title: "Orthorectified frame",
+  readout: (point) => [
+    `${toPlan(point)
+      .map((value) => fixed(value, 2))
+      .join(", ")} m`,
+  ],
+});
 
 const moving = new PolygonEditor(framePane, {
   prefix: "moving",
   look: "moving",
   noun: "moving region",
   polygons: () => store.project.moving_regions_px,
-  save: (label, polygons, merge) => void store.edit(label, (draft) => void (draft.moving_regions_px = polygons.map(tenths)), { merge }),
+  save: (label, polygons, merge) =>
+    void store.edit(label, (draft) => void (draft.moving_regions_px = polygons.map(tenths)), { merge }),
   accepts: () => framePane.image !== null,
 });
 /** @type {PolygonEditor} */
@@ -67,9 +80,18 @@ const region = new PolygonEditor(planPane, {
   prefix: "region",
   look: "corner-point",
   noun: "region",
-  polygons: () => (targets.selected?.kind === "points" && targets.selected.region_m ? [targets.selected.region_m.map(toPixels)] : []),
-  save: (label, polygons, merge) => changeSelected(label, (target) => void (target.region_m = polygons[0]?.map(toPlan).map(millimetres) ?? target.region_m), merge),
-  accepts: () => planPane.image !== null && targets.selected?.kind === "points" && (region.isDrawing || targets.selected.region_m === null),
+  polygons: () =>
+    targets.selected?.kind === "points" && targets.selected.region_m ? [targets.selected.region_m.map(toPixels)] : [],
+  save: (label, polygons, merge) =>
+    changeSelected(
+      label,
+      (target) => void (target.region_m = polygons[0]?.map(toPlan).map(millimetres) ?? target.region_m),
+      merge,
+    ),
+  accepts: () =>
+    planPane.image !== null &&
+    targets.selected?.kind === "points" &&
+    (region.isDrawing || targets.selected.region_m === null),
   single: true,
 });
 const bands = new BandEditor(planPane, {
@@ -117,10 +139,23 @@ function showMoving() {
       h("span", { class: "swatch moving" }),
       h("button", { class: "name plain", type: "button", onclick: () => moving.select(i) }, `Region ${i + 1}`),
       h("span", { class: "badge" }, plural(corners.length, "corner")),
-      h("button", { class: "button quiet small icon-only", type: "button", "aria-label": `Delete region ${i + 1}`, onclick: remove }, icon("trash")),
+      h(
+        "button",
+        {
+          class: "button quiet small icon-only",
+          type: "button",
+          "aria-label": `Delete region ${i + 1}`,
+          onclick: remove,
+        },
+        icon("trash"),
+      ),
     );
   };
-  const none = h("li", { class: "none" }, "Outline everything that moves: building, table, its shadow. Nothing inside is used to follow the camera.");
+  const none = h(
+    "li",
+    { class: "none" },
+    "Outline everything that moves: building, table, its shadow. Nothing inside is used to follow the camera.",
+  );
   fill(movingList, regions.length === 0 ? none : regions.map(row));
 }
 
@@ -130,7 +165,9 @@ function draw() {
   framePane.setShapes([...moving.shapes(), ...previewShapes(preview, "raw", same)]);
   const isPoints = targets.selected?.kind === "points";
   planPane.setShapes([...(isPoints ? region.shapes() : bands.shapes()), ...previewShapes(preview, "plan", toPixels)]);
-  frameChrome.setHint(moving.isDrawing ? (moving.draft.length < 3 ? "Click the next corner" : "Enter or a double click closes") : "");
+  frameChrome.setHint(
+    moving.isDrawing ? (moving.draft.length < 3 ? "Click the next corner" : "Enter or a double click closes") : "",
+  );
   planChrome.setHint(planHint());
   find("#bands").hidden = isPoints;
   showBands(preview);
@@ -140,9 +177,18 @@ function draw() {
 function planHint() {
   const { selected } = targets;
   if (planPane.image === null) return "";
-  if (selected?.kind === "points") return region.isDrawing ? (region.draft.length < 3 ? "Click the next corner" : "Enter or a double click closes") : selected.region_m === null ? `Click the corners of ${selected.name}` : "";
+  if (selected?.kind === "points")
+    return region.isDrawing
+      ? region.draft.length < 3
+        ? "Click the next corner"
+        : "Enter or a double click closes"
+      : selected.region_m === null
+        ? `Click the corners of ${selected.name}`
+        : "";
   const line = bands.nextLine;
-  return line === null ? "" : `${line}: ${["click one end", "click the other end", "click at half the width"][bands.draft.length]}`;
+  return line === null
+    ? ""
+    : `${line}: ${["click one end", "click the other end", "click at half the width"][bands.draft.length]}`;
 }
 
 const askPreview = latest(
@@ -158,7 +204,8 @@ const askPreview = latest(
 );
 
 /** Whether there is anything of a target to look for: a band, or a closed region. @param {OpenTarget} target */
-const hasDrawing = (target) => (target.kind === "lines" ? Object.keys(target.lines ?? {}).length > 0 : isComplete(target));
+const hasDrawing = (target) =>
+  target.kind === "lines" ? Object.keys(target.lines ?? {}).length > 0 : isComplete(target);
 
 /** @param {OpenTarget | null} [target] as it stands while dragging */
 function refreshPreview(target = targets.selected) {
@@ -179,12 +226,17 @@ targets.on("change", () => {
 
 // --- layout
 
-const layouts = /** @type {const} */ ([["both", "Both"], ["frame", "Frame"], ["plan", "Orthorectified"]]);
+const layouts = /** @type {const} */ ([
+  ["both", "Both"],
+  ["frame", "Frame"],
+  ["plan", "Orthorectified"],
+]);
 /** @param {string} name */
 function setLayout(name) {
   const chosen = layouts.some(([key]) => key === name) ? name : "both";
   find("#panes").dataset.layout = chosen;
-  for (const button of find("#layout").querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.dataset.layout === chosen));
+  for (const button of find("#layout").querySelectorAll("button"))
+    button.setAttribute("aria-pressed", String(button.dataset.layout === chosen));
   setView({ layout: chosen === "both" ? null : chosen });
 }
 
@@ -193,12 +245,17 @@ function nextLayout() {
   setLayout(layouts[(at + 1) % layouts.length][0]);
 }
 
-find("#layout").append(...layouts.map(([key, words]) => h("button", { type: "button", "data-layout": key, onclick: () => setLayout(key) }, words)));
+find("#layout").append(
+  ...layouts.map(([key, words]) =>
+    h("button", { type: "button", "data-layout": key, onclick: () => setLayout(key) }, words),
+  ),
+);
 setLayout(viewText("layout") ?? "both");
 
 // --- keys
 
-const editorOf = (/** @type {Pane} */ pane) => (pane === framePane ? moving : targets.selected?.kind === "points" ? region : bands);
+const editorOf = (/** @type {Pane} */ pane) =>
+  pane === framePane ? moving : targets.selected?.kind === "points" ? region : bands;
 const focusedPane = () => panes.find((pane) => pane.hasFocus) ?? null;
 const focusedEditor = () => {
   const pane = focusedPane();
@@ -206,7 +263,11 @@ const focusedEditor = () => {
 };
 const bandKeys = () => planPane.hasFocus && bands.selected !== null;
 page.keys([
-  { keys: "Click", group: "Placing", label: "Left: next corner of a moving region. Right: two clicks along a line, the third at half the width" },
+  {
+    keys: "Click",
+    group: "Placing",
+    label: "Left: next corner of a moving region. Right: two clicks along a line, the third at half the width",
+  },
   { keys: "Drag", group: "Placing", label: "A corner, an edge, a band, its ends or its width. Elsewhere: pan" },
   {
     keys: "Enter",
@@ -219,16 +280,54 @@ page.keys([
       else focusedPane()?.clickCentre(event);
     },
   },
-  { keys: "Space", group: "Placing", label: "Click in the middle (keyboard)", when: () => focusedPane() !== null, run: (event) => focusedPane()?.clickCentre(event) },
-  { keys: "Escape", group: "Placing", label: "Take back the newest click; then select nothing", run: () => (focusedEditor() ?? bands).back() },
-  { keys: "Delete / Backspace", group: "Placing", label: "Delete the selected corner or region", when: () => focusedEditor() instanceof PolygonEditor, run: () => focusedEditor() instanceof PolygonEditor && /** @type {PolygonEditor} */ (focusedEditor()).remove() },
-  ...nudgeKeys(panes, { what: "what is selected", when: (pane) => editorOf(pane).selected !== null, nudge: (pane, delta) => editorOf(pane).nudge(delta) }),
-  { keys: "Ctrl+Z", group: "Placing", label: "Take back the newest click of an unfinished shape first", when: () => [moving, region, bands].some((editor) => editor.isDrawing), run: () => [moving, region, bands].find((editor) => editor.isDrawing)?.back() },
+  {
+    keys: "Space",
+    group: "Placing",
+    label: "Click in the middle (keyboard)",
+    when: () => focusedPane() !== null,
+    run: (event) => focusedPane()?.clickCentre(event),
+  },
+  {
+    keys: "Escape",
+    group: "Placing",
+    label: "Take back the newest click; then select nothing",
+    run: () => (focusedEditor() ?? bands).back(),
+  },
+  {
+    keys: "Delete / Backspace",
+    group: "Placing",
+    label: "Delete the selected corner or region",
+    when: () => focusedEditor() instanceof PolygonEditor,
+    run: () => focusedEditor() instanceof PolygonEditor && /** @type {PolygonEditor} */ (focusedEditor()).remove(),
+  },
+  ...nudgeKeys(panes, {
+    what: "what is selected",
+    when: (pane) => editorOf(pane).selected !== null,
+    nudge: (pane, delta) => editorOf(pane).nudge(delta),
+  }),
+  {
+    keys: "Ctrl+Z",
+    group: "Placing",
+    label: "Take back the newest click of an unfinished shape first",
+    when: () => [moving, region, bands].some((editor) => editor.isDrawing),
+    run: () => [moving, region, bands].find((editor) => editor.isDrawing)?.back(),
+  },
   { keys: "[", group: "Bands", label: "Narrower by 2 cm", when: bandKeys, run: () => bands.widen(-WIDTH_STEP_M) },
   { keys: "]", group: "Bands", label: "Wider by 2 cm", when: bandKeys, run: () => bands.widen(WIDTH_STEP_M) },
-  { keys: ",", group: "Bands", label: "Turn counter-clockwise by 0.2°", when: bandKeys, run: () => bands.turn(TURN_STEP_RAD) },
+  {
+    keys: ",",
+    group: "Bands",
+    label: "Turn counter-clockwise by 0.2°",
+    when: bandKeys,
+    run: () => bands.turn(TURN_STEP_RAD),
+  },
   { keys: ".", group: "Bands", label: "Turn clockwise by 0.2°", when: bandKeys, run: () => bands.turn(-TURN_STEP_RAD) },
-  { keys: "Z", group: "Looking", label: "Loupe", run: () => loupes.forEach((loupe) => loupe.setEnabled(!loupe.enabled)) },
+  {
+    keys: "Z",
+    group: "Looking",
+    label: "Loupe",
+    run: () => loupes.forEach((loupe) => loupe.setEnabled(!loupe.enabled)),
+  },
   { keys: "V", group: "Looking", label: "Both pictures, the frame, the orthorectified frame", run: nextLayout },
   ...paneKeys(panes, { canPan: () => focusedEditor()?.selected == null }),
 ]);
@@ -238,7 +337,11 @@ page.keys([
 async function loadFrame() {
   if (framePane.image === null) frameChrome.setNote("Loading the frame…");
   try {
-    framePane.setImage(await PaneImage.load(`/api/${projectPath(page.id, `frames/${store.project.reference_frame}.jpg`)}`, { onLevel: () => framePane.invalidate() }));
+    framePane.setImage(
+      await PaneImage.load(`/api/${projectPath(page.id, `frames/${store.project.reference_frame}.jpg`)}`, {
+        onLevel: () => framePane.invalidate(),
+      }),
+    );
     frameChrome.setTitle(`Frame ${store.project.reference_frame} · raw`);
     frameChrome.setNote();
   } catch (error) {
@@ -251,11 +354,22 @@ async function loadPlan() {
   try {
     const answer = await get(projectPath(page.id, "rectified"));
     if (!answer.ready) {
-      planChrome.setNote(answer.message, h("a", { class: "button primary", href: `/p/${encodeURIComponent(page.id)}/correspondences` }, "Place correspondences"));
+      planChrome.setNote(
+        answer.message,
+        h(
+          "a",
+          { class: "button primary", href: `/p/${encodeURIComponent(page.id)}/correspondences` },
+          "Place correspondences",
+        ),
+      );
       return;
     }
     grid = answer.grid;
-    planPane.setImage(await PaneImage.load(`/api/${projectPath(page.id, "rectified.jpg", { v: store.revision })}`, { onLevel: () => planPane.invalidate() }));
+    planPane.setImage(
+      await PaneImage.load(`/api/${projectPath(page.id, "rectified.jpg", { v: store.revision })}`, {
+        onLevel: () => planPane.invalidate(),
+      }),
+    );
     planChrome.setNote();
     draw();
     refreshPreview();
@@ -265,7 +379,9 @@ async function loadPlan() {
 }
 
 store.on("change", ({ project, previous }) => {
-  const rectifiedAnew = JSON.stringify([project.correspondences, project.orthoimage, project.inputs]) !== JSON.stringify([previous.correspondences, previous.orthoimage, previous.inputs]);
+  const rectifiedAnew =
+    JSON.stringify([project.correspondences, project.orthoimage, project.inputs]) !==
+    JSON.stringify([previous.correspondences, previous.orthoimage, previous.inputs]);
   if (project.reference_frame !== previous.reference_frame) void loadFrame();
   if (rectifiedAnew || project.reference_frame !== previous.reference_frame) void loadPlan().catch(toastError);
 });

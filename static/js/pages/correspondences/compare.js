@@ -12,9 +12,28 @@ import { toastError } from "../../components/toast.js";
 export function compareControls(pane, { load }) {
   /** @type {Mode} */
   let mode = "off";
-  const slider = h("input", { type: "range", min: 0, max: 1, step: 0.01, value: 0.5, "aria-label": "Share of the orthorectified frame", hidden: true });
-  const buttons = /** @type {Mode[]} */ (["off", "blend", "swipe"]).map((name) => h("button", { type: "button", "aria-pressed": String(name === mode), "data-mode": name, onclick: () => void set(name) }, { off: "Ortho", blend: "Blend", swipe: "Swipe" }[name]));
-  const element = h("div", { class: "compare" }, slider, h("div", { class: "segmented", role: "group", "aria-label": "Compare with the orthorectified frame" }, buttons));
+  const slider = h("input", {
+    type: "range",
+    min: 0,
+    max: 1,
+    step: 0.01,
+    value: 0.5,
+    "aria-label": "Share of the orthorectified frame",
+    hidden: true,
+  });
+  const buttons = /** @type {Mode[]} */ (["off", "blend", "swipe"]).map((name) =>
+    h(
+      "button",
+      { type: "button", "aria-pressed": String(name === mode), "data-mode": name, onclick: () => void set(name) },
+      { off: "Ortho", blend: "Blend", swipe: "Swipe" }[name],
+    ),
+  );
+  const element = h(
+    "div",
+    { class: "compare" },
+    slider,
+    h("div", { class: "segmented", role: "group", "aria-label": "Compare with the orthorectified frame" }, buttons),
+  );
   slider.addEventListener("input", () => mix());
 
   const isOn = () => mode !== "off";

@@ -26,7 +26,13 @@ export function fitPanel(element) {
   const message = h("p", { class: "note", role: "status", hidden: true });
   const grid = h("div", { class: "coverage", role: "img" });
   const camera = h("p", { class: "small faint number" });
-  fill(element, h("header", {}, h("h2", {}, "Fit")), figures, message, h("div", { class: "coverage-row" }, grid, camera));
+  fill(
+    element,
+    h("header", {}, h("h2", {}, "Fit")),
+    figures,
+    message,
+    h("div", { class: "coverage-row" }, grid, camera),
+  );
 
   /** @param {Fit} fit @param {number} enabled @param {number} total */
   return function show(fit, enabled, total) {
@@ -39,9 +45,18 @@ export function fitPanel(element) {
     );
     message.hidden = !fit.message;
     message.className = `note ${TONES[fit.state] ?? "warn"}`;
-    fill(message, icon(fit.state === "ok" ? "check" : fit.state === "too_few" ? "info" : "warn"), h("span", {}, fit.message));
+    fill(
+      message,
+      icon(fit.state === "ok" ? "check" : fit.state === "too_few" ? "info" : "warn"),
+      h("span", {}, fit.message),
+    );
     showCoverage(grid, fit.coverage);
-    fill(camera, ...(fit.camera === null ? ["Pairs per part of the picture. Fill the empty parts first."] : cameraLines(fit.camera)));
+    fill(
+      camera,
+      ...(fit.camera === null
+        ? ["Pairs per part of the picture. Fill the empty parts first."]
+        : cameraLines(fit.camera)),
+    );
   };
 }
 
@@ -54,10 +69,19 @@ function showCoverage(element, coverage) {
   element.style.gridTemplateColumns = `repeat(${rows[0]?.length ?? 1}, 1fr)`;
   element.hidden = rows.length === 0;
   element.setAttribute("aria-label", `Pairs cover ${fixed(100 * (coverage?.share ?? 0), 0)} % of the picture`);
-  fill(element, rows.flat().map((n) => h("span", { class: n === 0 ? "none" : n === 1 ? "one" : "some" }, n === 0 ? "" : n)));
+  fill(
+    element,
+    rows.flat().map((n) => h("span", { class: n === 0 ? "none" : n === 1 ? "one" : "some" }, n === 0 ? "" : n)),
+  );
 }
 
 /** @param {NonNullable<Fit["camera"]>} camera */
 function cameraLines({ centre_m, height_m, tilt_deg, azimuth_deg }) {
-  return [`Camera ${metres(height_m, 1)} above the ground`, h("br"), `at ${fixed(centre_m[0], 1)}, ${fixed(centre_m[1], 1)} m`, h("br"), `tilted ${degrees(tilt_deg)}, turned ${degrees(azimuth_deg)}`];
+  return [
+    `Camera ${metres(height_m, 1)} above the ground`,
+    h("br"),
+    `at ${fixed(centre_m[0], 1)}, ${fixed(centre_m[1], 1)} m`,
+    h("br"),
+    `tilted ${degrees(tilt_deg)}, turned ${degrees(azimuth_deg)}`,
+  ];
 }

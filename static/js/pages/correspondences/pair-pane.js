@@ -3,13 +3,16 @@
 import { Pane } from "../../components/pane.js";
 import { Loupe } from "../../components/loupe.js";
 import { paneChrome } from "../../components/pane-chrome.js";
-import { add, subtract, times } from "../../lib/coordinates.js";
+import { add, times } from "../../lib/coordinates.js";
 import { Emitter } from "../../lib/emitter.js";
+import { setView, viewNumbers } from "../../lib/view-state.js";
 import { otherSide } from "./slots.js";
 
 /** @typedef {import("../../lib/types.js").Point} Point */
 /** @typedef {import("./slots.js").Side} Side */
 /** @typedef {import("./slots.js").Slots} Slots */
+/** @typedef {import("./slots.js").Half} Half */
+/** @typedef {import("./transform.js").FrameName} FrameName */
 
 /**
  * How what is stored (raw px, or metres on the ground) relates to px of the picture shown. Promises where the server
@@ -33,6 +36,7 @@ export class PairPane extends Emitter {
   ghosts = new Map();
   /** @type {Map<number, Point>} from mark to where the fit wants it, px shown */
   residuals = new Map();
+  #frameName;
   #aims = false;
   /** @type {Promise<void>} */
   #nudges = Promise.resolve();
@@ -41,16 +45,57 @@ export class PairPane extends Emitter {
   /**
    * @param {HTMLElement} element
    * @param {Slots} slots
-   * @param {{side: Side, label: string, title: string, readout: (point: Point) => (Node | string)[]}} options
+   * @param {object} options
+   * @param {Side} options.side
+   * @param {string} options.view  name of the view in the URL
+   * @param {string} options.label
+   * @param {string} options.title
+   * @param {() => FrameName} options.frameName  of the picture shown
+   * @param {(point: Point) => string} options.readout
    */
-  constructor(element, slots, { side, label, title, readout }) {
+  constructor(element, slots, { side, view, label, title, frameName, readout }) {
     super();
     this.side = side;
     this.slots = slots;
+    this.viewName = view;
     this.pane = new Pane(element, { label });
     this.loupe = new Loupe(this.pane);
-    this.chrome = paneChrome(this.pane, { title, readout });
+    this.chrome = paneChrome(this.pane, { title, readout: (point) => [readout(point)] });
+    this.#frameName = frameName;
     this.#listen();
+  }
+
+  /** Frame of reference of the picture shown. */
+  get frameName() {
+    return this.#frameName();
+  }
+
+  /** @param {Half[]} halves @param {(Point | null)[]} places  px shown; null where there is none */
+  setGhosts(halves, places) {
+    this.ghosts = new Map();
+    places.forEach((place, i) => place !== null && this.ghosts.set(halves[i].id, place));
+    this.draw();
+  }
+
+  /** Look where another view looks, without leading it in turn. @param {Point} middle px shown @param {number} scale */
+  follow(middle, scale) {
+    this.pane.setView(this.pane.view.centredOn(middle, this.pane.size, scale), { silent: true });
+    this.chrome.refresh();
+    this.draw();
+    this.rememberView();
+  }
+
+  /** Put the view into the URL. */
+  rememberView() {
+    const { centre, view } = this.pane;
+    const [u, v] = centre.map((value) => value.toFixed(1));
+    setView({ [this.viewName]: `${u},${v},${view.scale.toPrecision(4)}` });
+  }
+
+  /** Look where the URL says. */
+  restoreView() {
+    const stored = viewNumbers(this.viewName, 3);
+    if (stored !== null) this.pane.lookAt([stored[0], stored[1]], stored[2]);
   }
 
   /** The place of a pair in this pane, or of its ghost. @param {number} id */
@@ -81,16 +126,31 @@ export class PairPane extends Emitter {
       const point = this.shown.get(id);
       if (point === undefined) return;
       const offset = this.residuals.get(id);
-      if (offset !== undefined && !look.includes("off")) shapes.push({ id: `residual-${id}`, kind: "arrow", class: "residual", points: [point, add(point, times(offset, this.#arrowScale))] });
-      shapes.push({ id: `pair-${id}`, kind: "mark", class: `${look} ${id === selected ? "selected" : ""}`, label: String(id), points: [point], grab: true });
+      if (offset !== undefined && !look.includes("off"))
+        shapes.push({
+          id: `residual-${id}`,
+          kind: "arrow",
+          class: "residual",
+          points: [point, add(point, times(offset, this.#arrowScale))],
+        });
+      shapes.push({
+        id: `pair-${id}`,
+        kind: "mark",
+        class: `${look} ${id === selected ? "selected" : ""}`,
+        label: String(id),
+        points: [point],
+        grab: true,
+      });
     };
     for (const pair of pairs) mark(pair.id, pair.enabled ? "" : "off");
     for (const half of halves) {
       const ghost = this.ghosts.get(half.id);
       if (half[this.side] !== null) mark(half.id, "pending");
-      else if (ghost !== undefined) shapes.push({ id: `ghost-${half.id}`, kind: "mark", class: "ghost", label: `${half.id}?`, points: [ghost] });
+      else if (ghost !== undefined)
+        shapes.push({ id: `ghost-${half.id}`, kind: "mark", class: "ghost", label: `${half.id}?`, points: [ghost] });
     }
-    if (this.#aims && this.pane.image !== null) shapes.push({ id: "aim", kind: "mark", class: "aim", points: [this.pane.centre] });
+    if (this.#aims && this.pane.image !== null)
+      shapes.push({ id: "aim", kind: "mark", class: "aim", points: [this.pane.centre] });
     this.pane.setShapes(shapes);
     const half = this.slots.waitingFor(this.side);
     this.chrome.setHint(half === null ? "" : `Click completes pair ${half.id}`);
@@ -152,7 +212,8 @@ export class PairPane extends Emitter {
   /** In the order made, though the server may have to be asked. @param {Point} shown @param {(stored: Point) => void} use */
   #store(shown, use) {
     const stored = this.mapping.stored(shown);
-    if (stored instanceof Promise) this.#nudges = this.#nudges.then(async () => use(await stored)).catch(() => this.refresh());
+    if (stored instanceof Promise)
+      this.#nudges = this.#nudges.then(async () => use(await stored)).catch(() => this.refresh());
     else use(stored);
   }
 
@@ -165,7 +226,5 @@ export class PairPane extends Emitter {
 }
 
 /** Halves that need a ghost on a side: clicked on the other side only. @param {Slots} slots @param {Side} side */
-export const halvesWithout = (slots, side) => slots.halves.filter((half) => half[side] === null && half[otherSide(side)] !== null);
-
-/** Offset from a to b. @param {Point} a @param {Point} b */
-export const offset = (a, b) => subtract(b, a);
+export const halvesWithout = (slots, side) =>
+  slots.halves.filter((half) => half[side] === null && half[otherSide(side)] !== null);

@@ -12,7 +12,10 @@ const OLD_NAMES = /** @type {Record<string, string>} */ ({ pixelX: "sourceX", pi
 export function pointsText(pairs) {
   const rows = pairs.map(({ ground_m, frame_px, enabled }) => {
     const source = qgisFromImage(frame_px);
-    return [...ground_m, ...source].map((value) => Number(value.toFixed(6))).concat([enabled ? 1 : 0, 0, 0, 0]).join(",");
+    return [...ground_m, ...source]
+      .map((value) => Number(value.toFixed(6)))
+      .concat([enabled ? 1 : 0, 0, 0, 0])
+      .join(",");
   });
   return [COLUMNS.join(","), ...rows, ""].join("\n");
 }
@@ -23,15 +26,26 @@ export function pointsText(pairs) {
  * @returns {Omit<Correspondence, "id">[]}
  */
 export function pairsFromPoints(text, name) {
-  const lines = text.split(/\r?\n/).map((line, i) => ({ line: line.trim(), number: i + 1 })).filter(({ line }) => line !== "" && !line.startsWith("#"));
+  const lines = text
+    .split(/\r?\n/)
+    .map((line, i) => ({ line: line.trim(), number: i + 1 }))
+    .filter(({ line }) => line !== "" && !line.startsWith("#"));
   const header = (lines[0]?.line ?? "").split(",").map((column) => OLD_NAMES[column.trim()] ?? column.trim());
   const missing = COLUMNS.slice(0, 4).filter((column) => !header.includes(column));
-  if (missing.length > 0) throw new Error(`${name}: the first line lacks ${missing.join(", ")}; save the points from the QGIS Georeferencer as .points.`);
+  if (missing.length > 0)
+    throw new Error(
+      `${name}: the first line lacks ${missing.join(", ")}; save the points from the QGIS Georeferencer as .points.`,
+    );
   return lines.slice(1).map(({ line, number }) => {
     const cells = line.split(",");
     const value = (/** @type {string} */ column) => Number(cells[header.indexOf(column)]?.trim() || NaN);
     const [x, y, u, v] = COLUMNS.slice(0, 4).map(value);
-    if (![x, y, u, v].every(Number.isFinite)) throw new Error(`${name}: line ${number} holds no four numbers; correct or remove it.`);
-    return { ground_m: [x, y], frame_px: imageFromQgis([u, v]), enabled: !header.includes("enable") || value("enable") !== 0 };
+    if (![x, y, u, v].every(Number.isFinite))
+      throw new Error(`${name}: line ${number} holds no four numbers; correct or remove it.`);
+    return {
+      ground_m: [x, y],
+      frame_px: imageFromQgis([u, v]),
+      enabled: !header.includes("enable") || value("enable") !== 0,
+    };
   });
 }

@@ -19,22 +19,53 @@ const FIELDS = /** @type {const} */ ([
 export function selectionPanel(element, slots, { goTo }) {
   const title = h("h2");
   const on = h("input", { type: "checkbox" });
-  const zoom = h("button", { class: "button quiet small icon-only", type: "button", "aria-label": "Zoom to this pair (G)", title: "Zoom to this pair (G)" }, icon("target"));
-  const remove = h("button", { class: "button quiet small icon-only danger", type: "button", "aria-label": "Delete this pair (Delete)", title: "Delete this pair (Delete)" }, icon("trash"));
-  const fields = FIELDS.map((field) => numberField({ ...field, value: null, optional: true, compact: true, onChange: (value) => type(field.side, field.axis, value) }));
+  const zoom = h(
+    "button",
+    {
+      class: "button quiet small icon-only",
+      type: "button",
+      "aria-label": "Zoom to this pair (G)",
+      title: "Zoom to this pair (G)",
+    },
+    icon("target"),
+  );
+  const remove = h(
+    "button",
+    {
+      class: "button quiet small icon-only danger",
+      type: "button",
+      "aria-label": "Delete this pair (Delete)",
+      title: "Delete this pair (Delete)",
+    },
+    icon("trash"),
+  );
+  const fields = FIELDS.map((field) =>
+    numberField({
+      ...field,
+      value: null,
+      optional: true,
+      compact: true,
+      onChange: (value) => type(field.side, field.axis, value),
+    }),
+  );
   /** Typed coordinates whose other axis is still empty. @type {Record<Side, [number | null, number | null]>} */
   let typed = { frame_px: [null, null], ground_m: [null, null] };
   let shown = /** @type {number | undefined} */ (undefined);
   fill(
     element,
     h("header", {}, title, h("label", { class: "switch small" }, on, "counts"), zoom, remove),
-    h("div", { class: "field-row" }, fields.map((field) => field.element)),
+    h(
+      "div",
+      { class: "field-row" },
+      fields.map((field) => field.element),
+    ),
   );
   on.addEventListener("change", () => slots.selected !== null && slots.toggle(slots.selected));
   zoom.addEventListener("click", () => slots.selected !== null && goTo(slots.selected));
   remove.addEventListener("click", () => slots.selected !== null && slots.remove(slots.selected));
 
-  const entry = () => slots.pairs.find((pair) => pair.id === slots.selected) ?? slots.halves.find((half) => half.id === slots.selected);
+  const entry = () =>
+    slots.pairs.find((pair) => pair.id === slots.selected) ?? slots.halves.find((half) => half.id === slots.selected);
   const type = (/** @type {Side} */ side, /** @type {0 | 1} */ axis, /** @type {number | null} */ value) => {
     const now = entry();
     if (now === undefined) return;
@@ -51,7 +82,8 @@ export function selectionPanel(element, slots, { goTo }) {
       if (shown !== now?.id) typed = { frame_px: [null, null], ground_m: [null, null] };
       shown = now?.id;
       const pair = slots.pairs.find((candidate) => candidate.id === now?.id);
-      title.textContent = now === undefined ? "No pair selected" : pair ? `Pair ${now.id}` : `Pair ${now.id}, unfinished`;
+      title.textContent =
+        now === undefined ? "No pair selected" : pair ? `Pair ${now.id}` : `Pair ${now.id}, unfinished`;
       on.checked = pair?.enabled ?? false;
       on.disabled = pair === undefined;
       for (const control of [zoom, remove, ...fields.map((field) => field.input)]) control.disabled = now === undefined;

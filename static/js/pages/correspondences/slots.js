@@ -57,7 +57,11 @@ export class Slots extends Emitter {
     const half = this.halves.find((entry) => entry.id === id);
     if (half !== undefined) {
       if (half[side] === null) this.#complete(id, side, point);
-      else this.#setHalves(this.halves.map((entry) => (entry.id === id ? { ...entry, [side]: point } : entry)), id);
+      else
+        this.#setHalves(
+          this.halves.map((entry) => (entry.id === id ? { ...entry, [side]: point } : entry)),
+          id,
+        );
       return;
     }
     const change = (/** @type {import("../../lib/types.js").Project} */ draft) => {
@@ -69,7 +73,11 @@ export class Slots extends Emitter {
 
   /** @param {number} id */
   remove(id) {
-    if (this.halves.some((half) => half.id === id)) return this.#setHalves(this.halves.filter((half) => half.id !== id), null);
+    if (this.halves.some((half) => half.id === id))
+      return this.#setHalves(
+        this.halves.filter((half) => half.id !== id),
+        null,
+      );
     const next = this.neighbour(1, id);
     this.select(next === id ? null : next);
     void this.store.edit(`Delete pair ${id}`, (draft) => {
@@ -111,9 +119,13 @@ export class Slots extends Emitter {
     if (half === undefined) return;
     const pair = { id, ground_m: half.ground_m ?? point, frame_px: half.frame_px ?? point, enabled: true };
     pair[side] = point;
-    this.#setHalves(this.halves.filter((entry) => entry.id !== id), id);
+    this.#setHalves(
+      this.halves.filter((entry) => entry.id !== id),
+      id,
+    );
     void this.store.edit(`Add pair ${id}`, (draft) => {
-      if (draft.correspondences.some((entry) => entry.id === id)) pair.id = Math.max(...draft.correspondences.map((entry) => entry.id)) + 1;
+      if (draft.correspondences.some((entry) => entry.id === id))
+        pair.id = Math.max(...draft.correspondences.map((entry) => entry.id)) + 1;
       draft.correspondences.push(pair);
     });
   }
@@ -134,7 +146,8 @@ export class Slots extends Emitter {
   #tidy() {
     const taken = new Set(this.pairs.map((pair) => pair.id));
     const halves = this.halves.filter((half) => !taken.has(half.id));
-    const known = this.selected === null || taken.has(this.selected) || halves.some((half) => half.id === this.selected);
+    const known =
+      this.selected === null || taken.has(this.selected) || halves.some((half) => half.id === this.selected);
     this.#setHalves(halves, known ? this.selected : null);
   }
 }

@@ -30,10 +30,15 @@ export class BoardView {
   /** @param {BoardImage} image */
   async show(image) {
     this.#shown = image;
-    this.chrome.setTitle(`${image.name} · ${image.corners_px === null ? "no board found" : plural(image.corners_px.length, "corner")}`);
+    this.chrome.setTitle(
+      `${image.name} · ${image.corners_px === null ? "no board found" : plural(image.corners_px.length, "corner")}`,
+    );
     this.chrome.setNote();
     try {
-      const loaded = await PaneImage.load(`/api/${projectPath(this.projectId, `lens/images/${encodeURIComponent(image.name)}`)}`, { onLevel: () => this.pane.invalidate() });
+      const loaded = await PaneImage.load(
+        `/api/${projectPath(this.projectId, `lens/images/${encodeURIComponent(image.name)}`)}`,
+        { onLevel: () => this.pane.invalidate() },
+      );
       if (this.#shown === image) this.pane.setImage(loaded);
     } catch {
       if (this.#shown !== image) return;

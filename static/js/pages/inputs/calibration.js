@@ -50,35 +50,89 @@ export function calibrationDialog(projectId) {
       let square_m = /** @type {number | null} */ (0.025);
       let columns = 9;
       let rows = 6;
-      const size = numberField({ label: "Square", unit: "m", value: square_m, decimals: 4, step: 0.001, min: 0.0001, onChange: (value) => (square_m = value) });
-      const across = numberField({ label: "Inner corners, long side", unit: "", value: columns, decimals: 0, step: 1, min: 3, onChange: (value) => (columns = value ?? columns) });
-      const down = numberField({ label: "short side", unit: "", value: rows, decimals: 0, step: 1, min: 3, onChange: (value) => (rows = value ?? rows) });
+      const size = numberField({
+        label: "Square",
+        unit: "m",
+        value: square_m,
+        decimals: 4,
+        step: 0.001,
+        min: 0.0001,
+        onChange: (value) => (square_m = value),
+      });
+      const across = numberField({
+        label: "Inner corners, long side",
+        unit: "",
+        value: columns,
+        decimals: 0,
+        step: 1,
+        min: 3,
+        onChange: (value) => (columns = value ?? columns),
+      });
+      const down = numberField({
+        label: "short side",
+        unit: "",
+        value: rows,
+        decimals: 0,
+        step: 1,
+        min: 3,
+        onChange: (value) => (rows = value ?? rows),
+      });
 
       const show = async () => {
-        if (chosen !== null) fill(list, h("li", { class: "path" }, chosen.length === 1 ? chosen[0] : `${chosen.length} files on this computer`));
+        if (chosen !== null)
+          fill(
+            list,
+            h("li", { class: "path" }, chosen.length === 1 ? chosen[0] : `${chosen.length} files on this computer`),
+          );
         else {
           const { images } = await get(projectPath(projectId, "lens/images"));
-          fill(list, images.length === 0 ? h("li", { class: "soft" }, "No pictures yet. Fifteen or more, the board at many places of the picture and tilted by 20 to 40°.") : images.map(thumbnail));
+          fill(
+            list,
+            images.length === 0
+              ? h(
+                  "li",
+                  { class: "soft" },
+                  "No pictures yet. Fifteen or more, the board at many places of the picture and tilted by 20 to 40°.",
+                )
+              : images.map(thumbnail),
+          );
         }
       };
       const thumbnail = (/** @type {{name: string}} */ { name }) => {
         const path = projectPath(projectId, `lens/images/${encodeURIComponent(name)}`);
-        const drop = h("button", { type: "button", "aria-label": `Remove ${name}`, onclick: () => void remove(path).then(show, toastError) }, icon("close", "small"));
+        const drop = h(
+          "button",
+          { type: "button", "aria-label": `Remove ${name}`, onclick: () => void remove(path).then(show, toastError) },
+          icon("close", "small"),
+        );
         return h("li", { class: "thumbnail" }, h("img", { src: `/api/${path}`, alt: name, loading: "lazy" }), drop);
       };
       const send = async () => {
         chosen = null;
-        for (const file of await pickFiles({ accept: "image/*", multiple: true })) await sendWithProgress(transfer, projectPath(projectId, "upload/checkerboard", { filename: file.name }), file);
+        for (const file of await pickFiles({ accept: "image/*", multiple: true }))
+          await sendWithProgress(
+            transfer,
+            projectPath(projectId, "upload/checkerboard", { filename: file.name }),
+            file,
+          );
         await show();
       };
       const choose = async (/** @type {"image" | "video"} */ kind) => {
-        const files = await chooseFiles({ title: kind === "image" ? "Choose the checkerboard pictures" : "Choose a video of the board", kind, multiple: kind === "image" });
+        const files = await chooseFiles({
+          title: kind === "image" ? "Choose the checkerboard pictures" : "Choose a video of the board",
+          kind,
+          multiple: kind === "image",
+        });
         if (files !== null) chosen = files;
         await show();
       };
       start.addEventListener("click", async () => {
         try {
-          await post(projectPath(projectId, "lens/calibrate"), { files: chosen ?? "uploaded", board: `${columns}x${rows}`, square_m });
+          await post(projectPath(projectId, "lens/calibrate"), {
+            files: chosen ?? "uploaded",
+            board: `${columns}x${rows}`,
+            square_m,
+          });
           close(true);
         } catch (error) {
           problem.hidden = false;
@@ -89,11 +143,37 @@ export function calibrationDialog(projectId) {
       const sources = h(
         "div",
         { class: "toolbar" },
-        h("button", { class: "button small", type: "button", onclick: () => void send().catch(toastError) }, icon("upload", "small"), "Send pictures…"),
-        h("button", { class: "button small", type: "button", onclick: () => void choose("image").catch(toastError) }, icon("folder", "small"), "Pictures on this computer…"),
-        h("button", { class: "button small", type: "button", onclick: () => void choose("video").catch(toastError) }, icon("video", "small"), "Video of the board…"),
+        h(
+          "button",
+          { class: "button small", type: "button", onclick: () => void send().catch(toastError) },
+          icon("upload", "small"),
+          "Send pictures…",
+        ),
+        h(
+          "button",
+          { class: "button small", type: "button", onclick: () => void choose("image").catch(toastError) },
+          icon("folder", "small"),
+          "Pictures on this computer…",
+        ),
+        h(
+          "button",
+          { class: "button small", type: "button", onclick: () => void choose("video").catch(toastError) },
+          icon("video", "small"),
+          "Video of the board…",
+        ),
       );
-      return [h("div", { class: "dialog-body" }, h("div", { class: "field-row" }, across.element, down.element, size.element), sources, transfer, list, problem), dialogActions(() => close(null), start)];
+      return [
+        h(
+          "div",
+          { class: "dialog-body" },
+          h("div", { class: "field-row" }, across.element, down.element, size.element),
+          sources,
+          transfer,
+          list,
+          problem,
+        ),
+        dialogActions(() => close(null), start),
+      ];
     },
   });
 }
@@ -127,28 +207,56 @@ function show(element, projectId, report) {
     },
     columns: [
       { key: "name", title: "Picture", cell: (view) => view.name, sort: (view) => view.name },
-      { key: "rms", title: "Error", number: true, cell: (view) => (view.rms_px === null ? "–" : pixels(view.rms_px)), sort: (view) => view.rms_px },
-      { key: "state", title: "", cell: (view) => (view.used ? "used" : view.left_out), tone: (view) => (view.used ? "" : "warn") },
+      {
+        key: "rms",
+        title: "Error",
+        number: true,
+        cell: (view) => (view.rms_px === null ? "–" : pixels(view.rms_px)),
+        sort: (view) => view.rms_px,
+      },
+      {
+        key: "state",
+        title: "",
+        cell: (view) => (view.used ? "used" : view.left_out),
+        tone: (view) => (view.used ? "" : "warn"),
+      },
     ],
   });
   table.setRows(report.views);
-  const parameters = h("dl", { class: "facts" }, report.parameters.flatMap(({ name, value, deviation }) => {
-    const decimals = Math.abs(value) > 10 ? 1 : 5;
-    return [h("dt", {}, name), h("dd", {}, `${fixed(value, decimals)} ± ${fixed(deviation, decimals)}`)];
-  }));
+  const parameters = h(
+    "dl",
+    { class: "facts" },
+    report.parameters.flatMap(({ name, value, deviation }) => {
+      const decimals = Math.abs(value) > 10 ? 1 : 5;
+      return [h("dt", {}, name), h("dd", {}, `${fixed(value, decimals)} ± ${fixed(deviation, decimals)}`)];
+    }),
+  );
   const figures = h(
     "div",
     { class: "figures" },
-    [[pixels(report.rms_px, 3), "RMS"], [`${used.length} of ${report.views.length}`, "pictures used"], [`${fixed(100 * report.covered_share, 0)} %`, "of the picture covered"], [`${report.board.join(" × ")}, ${fixed(report.square_m * 1000, 1)} mm`, "board"]].map(([value, name]) => h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name))),
+    [
+      [pixels(report.rms_px, 3), "RMS"],
+      [`${used.length} of ${report.views.length}`, "pictures used"],
+      [`${fixed(100 * report.covered_share, 0)} %`, "of the picture covered"],
+      [`${report.board.join(" × ")}, ${fixed(report.square_m * 1000, 1)} mm`, "board"],
+    ].map(([value, name]) => h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name))),
   );
-  const warnings = report.warnings.map((warning) => h("p", { class: "note warn" }, icon("warn"), h("span", {}, warning)));
+  const warnings = report.warnings.map((warning) =>
+    h("p", { class: "note warn" }, icon("warn"), h("span", {}, warning)),
+  );
   element.hidden = false;
   fill(
     element,
     h("header", {}, h("h2", {}, "Calibration report"), h("span", { class: "badge" }, plural(used.length, "picture"))),
     figures,
     ...warnings,
-    h("div", { class: "report-columns" }, h("div", { class: "report-table" }, table.element), board.element, parameters),
+    h(
+      "div",
+      { class: "report-columns" },
+      h("div", { class: "report-table" }, table.element),
+      board.element,
+      parameters,
+    ),
   );
   const first = used[0] ?? report.views[0];
   if (first !== undefined) {

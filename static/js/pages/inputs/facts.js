@@ -9,8 +9,14 @@ import { count, degrees, duration, fixed, metres, millimetres, pixels, size } fr
 /** @param {Facts} facts @returns {Fact[]} */
 function video(facts) {
   return [
-    ["Picture", `${facts.width} × ${facts.height} px${facts.rotation_deg ? `, turned upright by ${facts.rotation_deg}°` : ""}`],
-    ["Frame rate", `${fixed(facts.rate_hz, 2)} Hz${facts.variable_rate ? ", variable: each frame's own time is used" : ""}`],
+    [
+      "Picture",
+      `${facts.width} × ${facts.height} px${facts.rotation_deg ? `, turned upright by ${facts.rotation_deg}°` : ""}`,
+    ],
+    [
+      "Frame rate",
+      `${fixed(facts.rate_hz, 2)} Hz${facts.variable_rate ? ", variable: each frame's own time is used" : ""}`,
+    ],
     ["Length", `${duration(facts.duration_s)}, ${count(facts.frames)} frames`],
     ["Codec", facts.codec],
   ];
@@ -23,8 +29,18 @@ function cloud(facts) {
   return [
     ["Points", `${count(facts.points)}, ${fixed(facts.density_per_m2, 0)} per m²`],
     ["Extent", `${fixed(high[0] - low[0], 1)} × ${fixed(high[1] - low[1], 1)} × ${metres(high[2] - low[2], 1)}`],
-    ["Carries", [facts.has_color && "colour", facts.has_intensity && "intensity"].filter(Boolean).join(", ") || "positions only"],
-    ...(ground ? [/** @type {Fact} */ (["Ground", `at ${metres(ground.z_m)}, spread ${millimetres(ground.spread_m, 0)}, tilt ${degrees(ground.tilt_deg, 2)}`])] : []),
+    [
+      "Carries",
+      [facts.has_color && "colour", facts.has_intensity && "intensity"].filter(Boolean).join(", ") || "positions only",
+    ],
+    ...(ground
+      ? [
+          /** @type {Fact} */ ([
+            "Ground",
+            `at ${metres(ground.z_m)}, spread ${millimetres(ground.spread_m, 0)}, tilt ${degrees(ground.tilt_deg, 2)}`,
+          ]),
+        ]
+      : []),
   ];
 }
 
@@ -35,7 +51,12 @@ function lens(facts) {
     ["For pictures of", facts.image_size_px.join(" × ") + " px"],
     ["Focal length", `${facts.focal_px.map((/** @type {number} */ value) => fixed(value, 1)).join(", ")} px`],
     ["Principal point", `${facts.centre_px.map((/** @type {number} */ value) => fixed(value, 1)).join(", ")} px`],
-    ["Distortion", facts.distortion.map((/** @type {number} */ value, /** @type {number} */ i) => `${names[i]} ${fixed(value, 4)}`).join(", ")],
+    [
+      "Distortion",
+      facts.distortion
+        .map((/** @type {number} */ value, /** @type {number} */ i) => `${names[i]} ${fixed(value, 4)}`)
+        .join(", "),
+    ],
     ["Calibration RMS", pixels(facts.rms_px, 3)],
   ];
 }
@@ -55,5 +76,9 @@ const READERS = { video, cloud, lens, gps };
 export function factList(kind, facts) {
   const rows = READERS[kind](facts);
   const file = /** @type {Fact} */ (["File", facts.size ? `${facts.file}, ${size(facts.size)}` : facts.file]);
-  return h("dl", { class: "facts" }, [file, ...rows].flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+  return h(
+    "dl",
+    { class: "facts" },
+    [file, ...rows].flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]),
+  );
 }

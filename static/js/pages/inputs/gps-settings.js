@@ -4,7 +4,11 @@ import { h } from "../../lib/dom.js";
 import { dialogActions, openDialog } from "../../components/dialog.js";
 import { numberField } from "../../components/number-field.js";
 
-const COLUMNS = /** @type {const} */ ([["time", "Time, s"], ["x", "East, m"], ["y", "North, m"]]);
+const COLUMNS = /** @type {const} */ ([
+  ["time", "Time, s"],
+  ["x", "East, m"],
+  ["y", "North, m"],
+]);
 
 /** @param {import("../../lib/store.js").ProjectStore} store */
 export async function gpsSettings(store) {
@@ -16,16 +20,57 @@ export async function gpsSettings(store) {
     title: "GPS columns and antenna",
     body: (close) => {
       const inputs = COLUMNS.map(([key, label]) => {
-        const input = h("input", { class: "input", id: `gps-${key}`, type: "text", required: true, value: now[key], spellcheck: "false", oninput: () => void (wanted[key] = input.value.trim()) });
+        const input = h("input", {
+          class: "input",
+          id: `gps-${key}`,
+          type: "text",
+          required: true,
+          value: now[key],
+          spellcheck: "false",
+          oninput: () => void (wanted[key] = input.value.trim()),
+        });
         return h("div", { class: "field" }, h("label", { class: "label", for: `gps-${key}` }, label), input);
       });
-      const antenna = /** @type {const} */ ([["Antenna east", 0], ["Antenna north", 1]]).map(([label, axis]) => numberField({ label, unit: "m", value: at[axis], decimals: 3, optional: true, onChange: (value) => (at[axis] = value) }).element);
+      const antenna = /** @type {const} */ ([
+        ["Antenna east", 0],
+        ["Antenna north", 1],
+      ]).map(
+        ([label, axis]) =>
+          numberField({
+            label,
+            unit: "m",
+            value: at[axis],
+            decimals: 3,
+            optional: true,
+            onChange: (value) => (at[axis] = value),
+          }).element,
+      );
       const submit = (/** @type {Event} */ event) => (event.preventDefault(), close(true));
-      const hint = h("p", { class: "small faint" }, "The antenna's place on the roof lets the building's rotation be taken into account. Leave it empty for the middle of P1 and P2.");
-      return [h("form", { class: "dialog-form", onsubmit: submit }, h("div", { class: "dialog-body" }, h("div", { class: "field-row" }, inputs), h("div", { class: "field-row" }, antenna), hint), dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, "Save")))];
+      const hint = h(
+        "p",
+        { class: "small faint" },
+        "The antenna's place on the roof lets the building's rotation be taken into account. Leave it empty for the middle of P1 and P2.",
+      );
+      return [
+        h(
+          "form",
+          { class: "dialog-form", onsubmit: submit },
+          h(
+            "div",
+            { class: "dialog-body" },
+            h("div", { class: "field-row" }, inputs),
+            h("div", { class: "field-row" }, antenna),
+            hint,
+          ),
+          dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, "Save")),
+        ),
+      ];
     },
   });
   if (accepted === null) return;
   const [east, north] = at;
-  await store.edit("GPS columns", (draft) => void (draft.inputs.gps = { ...wanted, at_m: east === null || north === null ? null : [east, north] }));
+  await store.edit(
+    "GPS columns",
+    (draft) => void (draft.inputs.gps = { ...wanted, at_m: east === null || north === null ? null : [east, north] }),
+  );
 }

@@ -28,10 +28,22 @@ export function inputCard({ projectId, kind, title, why, accept, glyph, onPath, 
   const badge = h("span", { class: "badge" });
   const body = h("div", { class: "input-body" });
   const transfer = h("div");
-  const browse = h("button", { class: "button small", type: "button" }, icon("folder", "small"), "Choose on this computer…");
+  const browse = h(
+    "button",
+    { class: "button small", type: "button" },
+    icon("folder", "small"),
+    "Choose on this computer…",
+  );
   const send = h("button", { class: "button small", type: "button" }, icon("upload", "small"), "Upload…");
   const drop = h("button", { class: "button quiet small", type: "button", hidden: true }, "Remove");
-  const element = h("section", { class: "card input-card", "data-kind": kind, "aria-label": title }, h("header", {}, icon(glyph), h("h2", {}, title), badge), body, transfer, h("div", { class: "toolbar" }, browse, send, more, h("span", { class: "spring" }), drop));
+  const element = h(
+    "section",
+    { class: "card input-card", "data-kind": kind, "aria-label": title },
+    h("header", {}, icon(glyph), h("h2", {}, title), badge),
+    body,
+    transfer,
+    h("div", { class: "toolbar" }, browse, send, more, h("span", { class: "spring" }), drop),
+  );
 
   browse.addEventListener("click", async () => {
     const files = await chooseFiles({ title: `Choose the ${title.toLowerCase()}`, kind });
@@ -60,12 +72,30 @@ export function inputCard({ projectId, kind, title, why, accept, glyph, onPath, 
       const state = facts === null ? "none" : facts.error ? "wrong" : facts.reading ? "reading" : "read";
       element.dataset.state = state;
       badge.className = `badge ${{ none: "", wrong: "bad", reading: "accent", read: "good" }[state]}`;
-      badge.textContent = { none: "not given", wrong: "cannot be used", reading: "being read…", read: "understood" }[state];
+      badge.textContent = { none: "not given", wrong: "cannot be used", reading: "being read…", read: "understood" }[
+        state
+      ];
       drop.hidden = facts === null || onRemove === null;
       if (facts === null) fill(body, h("p", { class: "soft" }, why));
-      else if (facts.error) fill(body, h("p", { class: "path" }, facts.file), h("p", { class: "note bad" }, icon("warn"), h("span", {}, facts.error.message)));
-      else if (facts.reading) fill(body, h("p", { class: "path" }, facts.file), h("progress", { "aria-label": "Reading" }));
-      else fill(body, factList(kind, facts), kind === "video" && h("img", { class: "still", alt: "First frame", src: `/api/${projectPath(projectId, "frames/0.jpg", { w: 480, v: facts.file })}` }));
+      else if (facts.error)
+        fill(
+          body,
+          h("p", { class: "path" }, facts.file),
+          h("p", { class: "note bad" }, icon("warn"), h("span", {}, facts.error.message)),
+        );
+      else if (facts.reading)
+        fill(body, h("p", { class: "path" }, facts.file), h("progress", { "aria-label": "Reading" }));
+      else
+        fill(
+          body,
+          factList(kind, facts),
+          kind === "video" &&
+            h("img", {
+              class: "still",
+              alt: "First frame",
+              src: `/api/${projectPath(projectId, "frames/0.jpg", { w: 480, v: facts.file })}`,
+            }),
+        );
     },
   };
 }
@@ -75,15 +105,34 @@ export async function sendWithProgress(place, path, file) {
   const cancel = new AbortController();
   const bar = h("progress", { max: 1, value: 0, "aria-label": `Sending ${file.name}` });
   const words = h("span", { class: "numbers number" });
-  const stop = h("button", { class: "button small", type: "button", onclick: () => cancel.abort() }, icon("close", "small"), "Cancel");
-  fill(place, h("div", { class: "job" }, h("div", { class: "job-head" }, h("strong", {}, `Sending ${file.name}`), words, stop), bar));
+  const stop = h(
+    "button",
+    { class: "button small", type: "button", onclick: () => cancel.abort() },
+    icon("close", "small"),
+    "Cancel",
+  );
+  fill(
+    place,
+    h(
+      "div",
+      { class: "job" },
+      h("div", { class: "job-head" }, h("strong", {}, `Sending ${file.name}`), words, stop),
+      bar,
+    ),
+  );
   const began = performance.now();
   try {
-    return await upload("PUT", path, file, (sent, total) => {
-      const speed = sent / Math.max(0.001, (performance.now() - began) / 1000);
-      bar.value = total === 0 ? 1 : sent / total;
-      words.textContent = `${size(sent)} of ${size(total)} · ${fixed(speed / 1e6, 1)} MB/s · ${duration((total - sent) / speed)} left`;
-    }, cancel.signal);
+    return await upload(
+      "PUT",
+      path,
+      file,
+      (sent, total) => {
+        const speed = sent / Math.max(0.001, (performance.now() - began) / 1000);
+        bar.value = total === 0 ? 1 : sent / total;
+        words.textContent = `${size(sent)} of ${size(total)} · ${fixed(speed / 1e6, 1)} MB/s · ${duration((total - sent) / speed)} left`;
+      },
+      cancel.signal,
+    );
   } finally {
     fill(place);
   }

@@ -18,9 +18,23 @@ export function extentFields(onChange) {
     if (west !== null && south !== null && east !== null && north !== null) onChange([west, south, east, north]);
     else if (typed.every((entry) => entry === null)) onChange(null);
   };
-  const fields = SIDES.map((side, i) => numberField({ label: side, unit: "m", value: null, optional: true, compact: true, step: 0.5, onChange: (value) => take(i, value) }));
+  const fields = SIDES.map((side, i) =>
+    numberField({
+      label: side,
+      unit: "m",
+      value: null,
+      optional: true,
+      compact: true,
+      step: 0.5,
+      onChange: (value) => take(i, value),
+    }),
+  );
   return {
-    element: h("div", { class: "field-row" }, fields.map((field) => field.element)),
+    element: h(
+      "div",
+      { class: "field-row" },
+      fields.map((field) => field.element),
+    ),
     /** @param {Extent | null} extent @param {Extent | null} made of the orthoimage as it is */
     show(extent, made) {
       typed = extent === null ? [null, null, null, null] : [...extent];

@@ -16,11 +16,23 @@ export function heightPanel(element, targets, onTaken) {
   const box = h("div", { class: "settings", role: "status" });
   const target = h("select", { class: "input", id: "height-target" });
   const take = h("button", { class: "button", type: "button" }, icon("height"), "Take this height");
-  const row = h("div", { class: "take-height", hidden: true }, h("div", { class: "field" }, h("label", { class: "label", for: "height-target" }, "As the height of"), target), take);
+  const row = h(
+    "div",
+    { class: "take-height", hidden: true },
+    h("div", { class: "field" }, h("label", { class: "label", for: "height-target" }, "As the height of"), target),
+    take,
+  );
   /** @type {Height | null} */
   let seen = null;
   fill(element, h("header", {}, h("h2", {}, "Height of a place")), box, row);
-  fill(box, h("p", { class: "soft" }, "Click the roof, in 3D or on the orthoimage: its height above the ground is read from the full cloud."));
+  fill(
+    box,
+    h(
+      "p",
+      { class: "soft" },
+      "Click the roof, in 3D or on the orthoimage: its height above the ground is read from the full cloud.",
+    ),
+  );
   take.addEventListener("click", () => {
     if (seen === null) return;
     const height_m = Math.round(seen.height_m * 100) / 100;
@@ -30,7 +42,13 @@ export function heightPanel(element, targets, onTaken) {
   });
   const showTargets = () => {
     const chosen = target.value;
-    fill(target, targets.all.map(({ name, height_m }) => h("option", { value: name }, height_m === null ? name : `${name} (now ${metres(height_m)})`)), h("option", { value: NEW }, "a new target"));
+    fill(
+      target,
+      targets.all.map(({ name, height_m }) =>
+        h("option", { value: name }, height_m === null ? name : `${name} (now ${metres(height_m)})`),
+      ),
+      h("option", { value: NEW }, "a new target"),
+    );
     target.value = targets.all.some(({ name }) => name === chosen) ? chosen : (targets.all[0]?.name ?? NEW);
   };
   targets.on("change", showTargets);
@@ -41,8 +59,19 @@ export function heightPanel(element, targets, onTaken) {
       seen = height;
       row.hidden = false;
       const [x, y] = height.place_m;
-      const figures = h("div", { class: "figures" }, figure(metres(height.height_m), "above the ground"), figure(`± ${millimetres(height.spread_m, 0)}`, `spread of ${plural(height.points, "point")}`));
-      fill(box, figures, h("p", { class: "small faint number" }, `at ${fixed(x, 2)}, ${fixed(y, 2)} m`), height.spread_m > UNEVEN_M && note("warn", "The cloud is uneven here: an edge, or several surfaces. Click the middle of a flat part."));
+      const figures = h(
+        "div",
+        { class: "figures" },
+        figure(metres(height.height_m), "above the ground"),
+        figure(`± ${millimetres(height.spread_m, 0)}`, `spread of ${plural(height.points, "point")}`),
+      );
+      fill(
+        box,
+        figures,
+        h("p", { class: "small faint number" }, `at ${fixed(x, 2)}, ${fixed(y, 2)} m`),
+        height.spread_m > UNEVEN_M &&
+          note("warn", "The cloud is uneven here: an edge, or several surfaces. Click the middle of a flat part."),
+      );
     },
     /** @param {string} message */
     refuse(message) {

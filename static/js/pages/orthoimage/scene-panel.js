@@ -10,25 +10,50 @@ import { toastError } from "../../components/toast.js";
 
 /** @typedef {"cloud" | "ground" | "orthoimage" | "camera" | "lines"} Part */
 
-const CHOICES = [{ value: "100000", name: "100 k" }, { value: "1000000", name: "1 M" }, { value: "5000000", name: "5 M" }];
-const PARTS = /** @type {const} */ ([["cloud", "Cloud"], ["ground", "Ground plane"], ["orthoimage", "Orthoimage"], ["camera", "Camera"], ["lines", "Lines"]]);
+const CHOICES = [
+  { value: "100000", name: "100 k" },
+  { value: "1000000", name: "1 M" },
+  { value: "5000000", name: "5 M" },
+];
+const PARTS = /** @type {const} */ ([
+  ["cloud", "Cloud"],
+  ["ground", "Ground plane"],
+  ["orthoimage", "Orthoimage"],
+  ["camera", "Camera"],
+  ["lines", "Lines"],
+]);
 
 /** @param {HTMLElement} element @param {string} projectId @param {(message: string) => void} onMessage */
 export function scenePanel(element, projectId, onMessage) {
-  const wish = { colour: "rgb", points: pointsShown(), show: /** @type {Record<Part, boolean>} */ ({ cloud: true, ground: true, orthoimage: false, camera: true, lines: true }) };
+  const wish = {
+    colour: "rgb",
+    points: pointsShown(),
+    show: /** @type {Record<Part, boolean>} */ ({
+      cloud: true,
+      ground: true,
+      orthoimage: false,
+      camera: true,
+      lines: true,
+    }),
+  };
   const shown = h("p", { class: "small faint number", role: "status" });
   const ask = latest(
     (/** @type {typeof wish} */ wanted) => post(projectPath(projectId, "scene"), wanted),
     (answer) => {
       onMessage(answer.ready === false ? answer.message : "");
-      if (answer.points_total) shown.textContent = `${count(answer.points_shown)} of ${plural(answer.points_total, "point")} drawn; the engine uses all`;
+      if (answer.points_total)
+        shown.textContent = `${count(answer.points_shown)} of ${plural(answer.points_total, "point")} drawn; the engine uses all`;
     },
     toastError,
   );
   const send = () => ask(structuredClone(wish));
   const colour = segmented({
     label: "Colour of the cloud",
-    choices: [{ value: "rgb", name: "Colour" }, { value: "intensity", name: "Intensity" }, { value: "height", name: "Height" }],
+    choices: [
+      { value: "rgb", name: "Colour" },
+      { value: "intensity", name: "Intensity" },
+      { value: "height", name: "Height" },
+    ],
     value: "rgb",
     onChange: (value) => ((wish.colour = value), send()),
   });
@@ -39,9 +64,19 @@ export function scenePanel(element, projectId, onMessage) {
     onChange: (value) => ((wish.points = Number(value)), send()),
   });
   const parts = PARTS.map(([part, name]) => {
-    const input = h("input", { type: "checkbox", checked: wish.show[part], onchange: () => ((wish.show[part] = input.checked), send()) });
+    const input = h("input", {
+      type: "checkbox",
+      checked: wish.show[part],
+      onchange: () => ((wish.show[part] = input.checked), send()),
+    });
     return h("label", { class: "check" }, input, name);
   });
-  fill(element, h("header", {}, h("h2", {}, "3D view")), h("div", { class: "toolbar" }, colour.element, points.element), h("div", { class: "parts" }, parts), shown);
+  fill(
+    element,
+    h("header", {}, h("h2", {}, "3D view")),
+    h("div", { class: "toolbar" }, colour.element, points.element),
+    h("div", { class: "parts" }, parts),
+    shown,
+  );
   return { send };
 }

@@ -18,7 +18,16 @@ export function newProjectDialog() {
   return openDialog({
     title: "New project",
     body: (close) => {
-      const name = h("input", { class: "input", id: "project-name", type: "text", required: true, placeholder: "EQ7", autocomplete: "off", spellcheck: "false", autofocus: true });
+      const name = h("input", {
+        class: "input",
+        id: "project-name",
+        type: "text",
+        required: true,
+        placeholder: "EQ7",
+        autocomplete: "off",
+        spellcheck: "false",
+        autofocus: true,
+      });
       const problem = h("p", { class: "note bad", role: "alert", hidden: true });
       /** @type {Record<string, string>} */
       const chosen = {};
@@ -30,9 +39,25 @@ export function newProjectDialog() {
           chosen[kind] = files[0];
           path.textContent = files[0];
           path.className = "path";
-          if (name.value === "" && kind === "video") name.value = files[0].split("/").at(-1)?.replace(/\.[^.]+$/, "") ?? "";
+          if (name.value === "" && kind === "video")
+            name.value =
+              files[0]
+                .split("/")
+                .at(-1)
+                ?.replace(/\.[^.]+$/, "") ?? "";
         };
-        return h("div", { class: "source-row", "data-kind": kind }, h("span", { class: "label" }, title), path, h("button", { class: "button small", type: "button", onclick: () => void choose() }, icon("folder", "small"), "Browse…"));
+        return h(
+          "div",
+          { class: "source-row", "data-kind": kind },
+          h("span", { class: "label" }, title),
+          path,
+          h(
+            "button",
+            { class: "button small", type: "button", onclick: () => void choose() },
+            icon("folder", "small"),
+            "Browse…",
+          ),
+        );
       });
       const submit = async (/** @type {Event} */ event) => {
         event.preventDefault();
@@ -44,8 +69,24 @@ export function newProjectDialog() {
         }
       };
       const field = h("div", { class: "field" }, h("label", { class: "label", for: "project-name" }, "Name"), name);
-      const files = h("div", { class: "source-rows" }, rows, h("p", { class: "small faint" }, "Files stay where they are. All of them can be chosen, sent or changed later, in step 1."));
-      return [h("form", { class: "dialog-form", onsubmit: submit }, h("div", { class: "dialog-body" }, field, files, problem), dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, "Create")))];
+      const files = h(
+        "div",
+        { class: "source-rows" },
+        rows,
+        h(
+          "p",
+          { class: "small faint" },
+          "Files stay where they are. All of them can be chosen, sent or changed later, in step 1.",
+        ),
+      );
+      return [
+        h(
+          "form",
+          { class: "dialog-form", onsubmit: submit },
+          h("div", { class: "dialog-body" }, field, files, problem),
+          dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, "Create")),
+        ),
+      ];
     },
   });
 }

@@ -72,10 +72,27 @@ export class BandEditor extends Emitter {
       if (band === undefined) continue;
       const isSelected = this.selected?.line === line;
       const look = line.toLowerCase();
-      shapes.push({ id: `band:${line}:band`, kind: "polygon", class: `${look} ${isSelected ? "hot" : "thin"}`, points: cornersOf(band).map(toPixels), label: line, grab: true });
+      shapes.push({
+        id: `band:${line}:band`,
+        kind: "polygon",
+        class: `${look} ${isSelected ? "hot" : "thin"}`,
+        points: cornersOf(band).map(toPixels),
+        label: line,
+        grab: true,
+      });
       if (!isSelected) continue;
-      for (const [part, place] of /** @type {[Part, Point][]} */ ([["width", widthHandle(band)], ["from_m", band.from_m], ["to_m", band.to_m]])) {
-        shapes.push({ id: `band:${line}:${part}`, kind: "handle", class: `${look} ${this.selected?.part === part ? "selected" : ""}`, points: [toPixels(place)], grab: true });
+      for (const [part, place] of /** @type {[Part, Point][]} */ ([
+        ["width", widthHandle(band)],
+        ["from_m", band.from_m],
+        ["to_m", band.to_m],
+      ])) {
+        shapes.push({
+          id: `band:${line}:${part}`,
+          kind: "handle",
+          class: `${look} ${this.selected?.part === part ? "selected" : ""}`,
+          points: [toPixels(place)],
+          grab: true,
+        });
       }
     }
     return [...shapes, ...this.#draftShapes()];
@@ -90,11 +107,29 @@ export class BandEditor extends Emitter {
     const [from, to] = this.draft;
     const look = `${line.toLowerCase()} dashed`;
     /** @type {Shape[]} */
-    const shapes = this.draft.map((point, i) => ({ id: `draft:${i}`, kind: "handle", class: look, points: [toPixels(point)] }));
-    if (to === undefined && cursor !== null) shapes.push({ id: "draft:line", kind: "polyline", class: look, points: [from, cursor].map(toPixels), label: line });
+    const shapes = this.draft.map((point, i) => ({
+      id: `draft:${i}`,
+      kind: "handle",
+      class: look,
+      points: [toPixels(point)],
+    }));
+    if (to === undefined && cursor !== null)
+      shapes.push({
+        id: "draft:line",
+        kind: "polyline",
+        class: look,
+        points: [from, cursor].map(toPixels),
+        label: line,
+      });
     if (to !== undefined) {
       const band = { from_m: from, to_m: to, width_m: cursor === null ? SMALLEST_WIDTH_M : widthTo(from, to, cursor) };
-      shapes.push({ id: "draft:band", kind: "polygon", class: look, points: cornersOf(band).map(toPixels), label: line });
+      shapes.push({
+        id: "draft:band",
+        kind: "polygon",
+        class: look,
+        points: cornersOf(band).map(toPixels),
+        label: line,
+      });
     }
     return shapes;
   }
@@ -105,13 +140,19 @@ export class BandEditor extends Emitter {
     if (line === null) return this.select(null);
     const [from, to] = this.draft;
     this.selected = null;
-    if (from !== undefined && to === undefined && Math.hypot(plan[0] - from[0], plan[1] - from[1]) < SMALLEST_LENGTH_M) return;
+    if (from !== undefined && to === undefined && Math.hypot(plan[0] - from[0], plan[1] - from[1]) < SMALLEST_LENGTH_M)
+      return;
     if (to === undefined) this.draft = [...this.draft, plan];
     else {
       this.draft = [];
       this.redrawing = null;
       this.selected = { line, part: "band" };
-      this.options.save(line, rounded({ from_m: from, to_m: to, width_m: widthTo(from, to, plan) }), `Draw ${line}`, false);
+      this.options.save(
+        line,
+        rounded({ from_m: from, to_m: to, width_m: widthTo(from, to, plan) }),
+        `Draw ${line}`,
+        false,
+      );
     }
     this.emit("change", null);
   }
@@ -153,7 +194,11 @@ export class BandEditor extends Emitter {
 
   /** @param {number} by_m */
   widen(by_m) {
-    if (this.selected !== null) this.#change((band) => ({ ...band, width_m: Math.max(SMALLEST_WIDTH_M, band.width_m + by_m) }), `Width of ${this.selected.line}`);
+    if (this.selected !== null)
+      this.#change(
+        (band) => ({ ...band, width_m: Math.max(SMALLEST_WIDTH_M, band.width_m + by_m) }),
+        `Width of ${this.selected.line}`,
+      );
   }
 
   /** @param {number} angle_rad counter-clockwise */

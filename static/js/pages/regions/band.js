@@ -56,5 +56,9 @@ export const lengthOf = (band) => distance(band.from_m, band.to_m);
 /** To a tenth of a millimetre, as stored. @param {Band} band @returns {Band} */
 export function rounded(band) {
   const round = (/** @type {number} */ value) => Math.round(value * 1e4) / 1e4;
-  return { from_m: [round(band.from_m[0]), round(band.from_m[1])], to_m: [round(band.to_m[0]), round(band.to_m[1])], width_m: round(band.width_m) };
+  return {
+    from_m: [round(band.from_m[0]), round(band.from_m[1])],
+    to_m: [round(band.to_m[0]), round(band.to_m[1])],
+    width_m: round(band.width_m),
+  };
 }

@@ -28,12 +28,32 @@ export function previewShapes(preview, frame, toPixels) {
   const shapes = [];
   for (const [line, found] of lines(preview)) {
     const midline = frame === "plan" ? found.midline_plan : found.midline_raw;
-    if (frame === "raw" && found.band_raw) shapes.push({ id: `found-band:${line}`, kind: "polygon", class: `${line.toLowerCase()} thin`, points: found.band_raw.map(toPixels), label: line });
-    if (midline) shapes.push({ id: `found:${line}`, kind: "polyline", class: `${line.toLowerCase()} thin`, points: midline.map(toPixels) });
+    if (frame === "raw" && found.band_raw)
+      shapes.push({
+        id: `found-band:${line}`,
+        kind: "polygon",
+        class: `${line.toLowerCase()} thin`,
+        points: found.band_raw.map(toPixels),
+        label: line,
+      });
+    if (midline)
+      shapes.push({
+        id: `found:${line}`,
+        kind: "polyline",
+        class: `${line.toLowerCase()} thin`,
+        points: midline.map(toPixels),
+      });
   }
   for (const name of /** @type {const} */ (["p1", "p2"])) {
     const point = preview?.[name]?.[frame];
-    if (point) shapes.push({ id: `found:${name}`, kind: "mark", class: "corner-point", label: name.toUpperCase(), points: [toPixels(point)] });
+    if (point)
+      shapes.push({
+        id: `found:${name}`,
+        kind: "mark",
+        class: "corner-point",
+        label: name.toUpperCase(),
+        points: [toPixels(point)],
+      });
   }
   return shapes;
 }
@@ -44,8 +64,15 @@ const PATCHES = "#fff04a";
 export function edgePainter(current, frame, toPixels) {
   return (context, view) => {
     const preview = current();
-    const dots = (/** @type {Point[]} */ points, /** @type {string} */ colour) => drawDots(context, points.map((point) => view.toCanvas(toPixels(point))), colour, Math.min(2.4, Math.max(1, view.scale * 0.6)));
-    for (const [line, found] of lines(preview)) dots((frame === "plan" ? found.edges_plan : found.edges_raw).flat(), COLOURS[line]);
+    const dots = (/** @type {Point[]} */ points, /** @type {string} */ colour) =>
+      drawDots(
+        context,
+        points.map((point) => view.toCanvas(toPixels(point))),
+        colour,
+        Math.min(2.4, Math.max(1, view.scale * 0.6)),
+      );
+    for (const [line, found] of lines(preview))
+      dots((frame === "plan" ? found.edges_plan : found.edges_raw).flat(), COLOURS[line]);
     dots((frame === "plan" ? preview?.points_plan : preview?.points_raw) ?? [], PATCHES);
   };
 }

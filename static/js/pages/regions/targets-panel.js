@@ -30,26 +30,62 @@ export function targetsPanel(element, targets) {
     const { selected } = targets;
     if (selected !== null) targets.change(selected.name, `${what} of ${selected.name}`, edit);
   };
-  const height = numberField({ label: "Height above ground", unit: "m", value: null, optional: true, step: 0.05, onChange: (value) => change("Height", (target) => void (target.height_m = value)) });
-  const apart = numberField({ label: "P1–P2 distance", unit: "m", value: null, decimals: 3, step: 0.01, min: 0.001, optional: true, onChange: (value) => change("P1–P2 distance", (target) => void (target.p1_p2_m = value)) });
+  const height = numberField({
+    label: "Height above ground",
+    unit: "m",
+    value: null,
+    optional: true,
+    step: 0.05,
+    onChange: (value) => change("Height", (target) => void (target.height_m = value)),
+  });
+  const apart = numberField({
+    label: "P1–P2 distance",
+    unit: "m",
+    value: null,
+    decimals: 3,
+    step: 0.01,
+    min: 0.001,
+    optional: true,
+    onChange: (value) => change("P1–P2 distance", (target) => void (target.p1_p2_m = value)),
+  });
   const relative = h("select", { class: "input", id: "relative-to" });
-  relative.addEventListener("change", () => change("Reference", (target) => void (target.relative_to = relative.value || null)));
+  relative.addEventListener("change", () =>
+    change("Reference", (target) => void (target.relative_to = relative.value || null)),
+  );
   fill(
     settings,
     h("div", { class: "field-row" }, height.element, apart.element),
-    h("div", { class: "field" }, h("label", { class: "label", for: "relative-to" }, "Displacement relative to"), relative),
+    h(
+      "div",
+      { class: "field" },
+      h("label", { class: "label", for: "relative-to" }, "Displacement relative to"),
+      relative,
+    ),
   );
 
   return function show() {
     const { all, selected } = targets;
-    fill(list, all.map((target) => row(targets, target, target.name === selected?.name)));
-    if (all.length === 0) fill(list, h("li", { class: "none" }, "Nothing to measure yet. Add the roof, and the shake table if it is in view."));
+    fill(
+      list,
+      all.map((target) => row(targets, target, target.name === selected?.name)),
+    );
+    if (all.length === 0)
+      fill(
+        list,
+        h("li", { class: "none" }, "Nothing to measure yet. Add the roof, and the shake table if it is in view."),
+      );
     settings.hidden = selected === null;
     if (selected === null) return;
     height.set(selected.height_m);
     apart.set(selected.p1_p2_m);
-    const bases = all.filter((target) => target.name !== selected.name && target.relative_to === null && isComplete(target));
-    fill(relative, h("option", { value: "" }, "its own rest position"), bases.map((target) => h("option", { value: target.name }, target.name)));
+    const bases = all.filter(
+      (target) => target.name !== selected.name && target.relative_to === null && isComplete(target),
+    );
+    fill(
+      relative,
+      h("option", { value: "" }, "its own rest position"),
+      bases.map((target) => h("option", { value: target.name }, target.name)),
+    );
     relative.value = selected.relative_to ?? "";
   };
 }
@@ -68,7 +104,15 @@ function row(targets, target, isSelected) {
   });
   return h(
     "li",
-    { role: "option", tabindex: 0, "aria-selected": String(isSelected), "data-target": target.name, onclick: choose, onkeydown: (/** @type {KeyboardEvent} */ event) => event.key === "Enter" && event.target === event.currentTarget && choose() },
+    {
+      role: "option",
+      tabindex: 0,
+      "aria-selected": String(isSelected),
+      "data-target": target.name,
+      onclick: choose,
+      onkeydown: (/** @type {KeyboardEvent} */ event) =>
+        event.key === "Enter" && event.target === event.currentTarget && choose(),
+    },
     icon(target.kind === "lines" ? "target" : "polygon"),
     h("span", { class: "name" }, target.name),
     h("span", { class: `badge ${isComplete(target) ? (target.height_m === null ? "warn" : "") : "accent"}` }, state),
@@ -78,9 +122,17 @@ function row(targets, target, isSelected) {
 
 /** @param {Targets} targets @param {string} name */
 async function rename(targets, name) {
-  const wanted = await askText({ title: "Rename target", label: "Name", value: name, action: "Rename", hint: "Letters, digits, - and _. It names the result file." });
+  const wanted = await askText({
+    title: "Rename target",
+    label: "Name",
+    value: name,
+    action: "Rename",
+    hint: "Letters, digits, - and _. It names the result file.",
+  });
   if (wanted === null || wanted === name) return;
-  if (!TARGET_NAME.test(wanted)) toast(`“${wanted}” cannot name a file: use letters, digits, - and _ only.`, { tone: "bad" });
-  else if (targets.all.some((target) => target.name === wanted)) toast(`There is already a target “${wanted}”.`, { tone: "bad" });
+  if (!TARGET_NAME.test(wanted))
+    toast(`“${wanted}” cannot name a file: use letters, digits, - and _ only.`, { tone: "bad" });
+  else if (targets.all.some((target) => target.name === wanted))
+    toast(`There is already a target “${wanted}”.`, { tone: "bad" });
   else targets.rename(name, wanted);
 }
