@@ -172,6 +172,12 @@ export class Plot extends Emitter {
     return x.length ? [Number(x[0]), Number(x[x.length - 1])] : [this.options.logX ? 0.01 : 0, 1];
   }
 
+  /** The part of x that is asked for. @returns {[number, number]} */
+  get shownX() {
+    const wanted = this.view ?? this.whole;
+    return this.options.logX ? roundedOutwards(wanted) : wanted;
+  }
+
   /** @returns {Iterable<Plot>} this plot and those linked with it */
   partners() {
     return (this.options.link && linked.get(this.options.link)) || [this];
@@ -180,7 +186,7 @@ export class Plot extends Emitter {
   /** @param {[number, number] | null} view */
   applyView(view) {
     this.view = view;
-    const [min, max] = view ?? this.whole;
+    const [min, max] = this.shownX;
     this.u.setScale("x", { min, max });
   }
 
@@ -200,7 +206,7 @@ export class Plot extends Emitter {
       padding: [8, 20, 0, 0],
       legend: { show: false },
       cursor: { drag: { x: false, y: false, setScale: false }, y: false, points: { size: 6 }, ...(link && { sync: { key: link } }) },
-      scales: { x: { time: false, distr: logX ? 3 : 1, range: () => this.view ?? this.whole }, y: { distr: logY ? 3 : 1, range: (_, low, high) => this.rangeY(low, high) } },
+      scales: { x: { time: false, distr: logX ? 3 : 1, range: () => this.shownX }, y: { distr: logY ? 3 : 1, range: (_, low, high) => this.rangeY(low, high) } },
       axes: [this.axisX(), this.axisY()],
       series: [{}, ...this.traces.map((trace) => this.series(trace))],
       hooks: {
@@ -256,10 +262,9 @@ export class Plot extends Emitter {
     return range;
   }
 
-  /** @param {number} low @param {number} high @returns {[number, number]} at most five decades, to their full tenths */
+  /** @param {number} low @param {number} high @returns {[number, number]} at most five decades */
   rangeLog(low, high) {
-    const top = 10 ** (Math.log10(high) + 0.1);
-    const range = /** @type {[number, number]} */ ([Math.max(low, top / 1e5), top]);
+    const range = roundedOutwards([Math.max(low, high / 1e5), high]);
     this.chooseUnit(range);
     return range;
   }
@@ -336,6 +341,13 @@ export class Plot extends Emitter {
 }
 
 const AXIS_FONT = "11px Inter, system-ui, sans-serif";
+
+/** To one digit each, where the ticks of a logarithmic axis begin and end. @param {[number, number]} range @returns {[number, number]} */
+function roundedOutwards([low, high]) {
+  const power = (/** @type {number} */ value) => 10 ** Math.floor(Math.log10(value));
+  const [least, most] = [Math.floor(low / power(low) + 1e-9) * power(low), Math.ceil(high / power(high) - 1e-9) * power(high)];
+  return [Number(least.toPrecision(1)), Number(most.toPrecision(1))];
+}
 
 /** @param {number} value @returns {string} without the digits of floating point */
 function round(value) {

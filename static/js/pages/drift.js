@@ -21,7 +21,7 @@ import { toastError } from "../components/toast.js";
 /** @typedef {import("../components/interval-fields.js").IntervalName} IntervalName */
 /** @typedef {{dx: (number | null)[], dy: (number | null)[]}} Pair */
 /** @typedef {{dx: number, dy: number}} Rms */
-/** @typedef {{time_s: number[], raw: Pair, filtered: Pair, pre_event_rms_m: Rms | null, filtered_pre_event_rms_m: Rms | null, warnings: string[]}} DriftAnswer */
+/** @typedef {{time_s: number[], raw: Pair, filtered: Pair, filtered_pre_event_rms_m: Rms | null, warnings: string[]}} DriftAnswer */
 /** @typedef {{corners_hz: number[], rms_m: Pair, knee_hz: number | null}} Sweep */
 /** @typedef {{frequency_hz: number[], dx_m: number[], dy_m: number[]}} Spectrum */
 
@@ -153,7 +153,7 @@ function showAnswer(newest) {
   opened();
   drawHistory();
   showFigures();
-  fill(warnings, newest.warnings.map((words) => note("warn", words)), newest.warnings.length ? null : note("good", "This corner frequency takes away nothing an engineer would miss."));
+  fill(warnings, newest.warnings.map((words) => note("warn", words)), newest.warnings.length ? null : note("info", "No warning for this corner frequency."));
 }
 
 function drawHistory() {
@@ -235,12 +235,10 @@ function markCorner() {
 function showFigures() {
   const figure = (/** @type {number | null | undefined} */ value_m, /** @type {string} */ name) => h("div", {}, h("span", { class: "value" }, millimetres(value_m, 1)), h("span", { class: "name" }, name));
   const key = axis === "x" ? "dx" : "dy";
-  const before = answer?.pre_event_rms_m?.[key];
   const after = answer?.filtered_pre_event_rms_m?.[key];
   const exact = results.summary?.targets?.[target]?.pre_event_rms_m?.[axis];
   fill(figures,
-    before == null ? null : figure(before, "raw, pre-event RMS"),
-    after == null ? null : figure(after, "filtered"),
+    after == null ? null : figure(after, "filtered, pre-event RMS"),
     exact == null || store.project.method !== "geometric" ? null : figure(exact, "geometric"));
 }
 
