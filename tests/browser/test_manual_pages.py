@@ -283,8 +283,8 @@ def test_regions_and_bands_are_drawn_and_previewed_as_the_engine_sees_them(brows
             beside = ends.mean(axis=0) + np.array([-along[1], along[0]]) * band["width_m"] / 2
             for place in (*ends, beside):
                 click_at(page, plan, size, ortho_px(grid, place))
+            expect(page.locator(f".band-row[data-line={line}] .found")).to_contain_text("points")
         expect(page.locator("#targets li[data-target=roof]")).to_be_visible()
-        expect(page.locator(".band-row[data-line=L1] .found")).to_contain_text("points")
         page.get_by_label("Height above ground").fill(str(target["height_m"]))
         page.get_by_label("P1–P2 distance").fill("1.22")
         page.keyboard.press("Enter")

@@ -2,9 +2,8 @@
 
 import { get, post, projectPath, sentence } from "../lib/api.js";
 import { orthoFromWorld, worldFromOrtho } from "../lib/coordinates.js";
-import { fill, find, h } from "../lib/dom.js";
-import { fixed, plural } from "../lib/format.js";
-import { icon } from "../lib/icons.js";
+import { find, h } from "../lib/dom.js";
+import { fixed } from "../lib/format.js";
 import { latest } from "../lib/latest.js";
 import { Targets, isComplete } from "../lib/targets.js";
 import { setView, viewText } from "../lib/view-state.js";
@@ -15,10 +14,12 @@ import { PaneImage } from "../components/pane-image.js";
 import { nudgeKeys, paneKeys } from "../components/pane-keys.js";
 import { openPage } from "../components/page.js";
 import { PolygonEditor } from "../components/polygon-editor.js";
+import { segmented } from "../components/segmented.js";
 import { toastError } from "../components/toast.js";
 import { BandEditor } from "./regions/band-editor.js";
 import { cornersOf } from "./regions/band.js";
 import { bandsPanel } from "./regions/bands-panel.js";
+import { movingPanel } from "./regions/moving-panel.js";
 import { edgePainter, previewShapes } from "./regions/preview.js";
 import { targetsPanel } from "./regions/targets-panel.js";
 
@@ -126,38 +127,11 @@ planPane.addPainter(edgePainter(() => preview, "plan", toPixels));
 
 const showTargets = targetsPanel(find("#targets"), targets);
 const showBands = bandsPanel(find("#bands"), bands, (line, band) => saveBand(line, band, `Number of ${line}`, true));
-const movingList = h("ul", { class: "target-list" });
-fill(find("#moving"), h("header", {}, h("h2", {}, "Moving regions")), movingList);
-
-function showMoving() {
-  const regions = store.project.moving_regions_px;
-  const row = (/** @type {Point[]} */ corners, /** @type {number} */ i) => {
-    const remove = () => void store.edit("Delete moving region", (draft) => void draft.moving_regions_px.splice(i, 1));
-    return h(
-      "li",
-      { "aria-selected": String(moving.selected?.polygon === i) },
-      h("span", { class: "swatch moving" }),
-      h("button", { class: "name plain", type: "button", onclick: () => moving.select(i) }, `Region ${i + 1}`),
-      h("span", { class: "badge" }, plural(corners.length, "corner")),
-      h(
-        "button",
-        {
-          class: "button quiet small icon-only",
-          type: "button",
-          "aria-label": `Delete region ${i + 1}`,
-          onclick: remove,
-        },
-        icon("trash"),
-      ),
-    );
-  };
-  const none = h(
-    "li",
-    { class: "none" },
-    "Outline everything that moves: building, table, its shadow. Nothing inside is used to follow the camera.",
-  );
-  fill(movingList, regions.length === 0 ? none : regions.map(row));
-}
+const showMoving = movingPanel(find("#moving"), {
+  onSelect: (index) => moving.select(index),
+  onRemove: (index) =>
+    void store.edit("Delete moving region", (draft) => void draft.moving_regions_px.splice(index, 1)),
+});
 
 // --- drawing and preview
 
@@ -171,7 +145,7 @@ function draw() {
   planChrome.setHint(planHint());
   find("#bands").hidden = isPoints;
   showBands(preview);
-  showMoving();
+  showMoving(store.project.moving_regions_px, moving.selected?.polygon ?? null);
 }
 
 function planHint() {
@@ -226,31 +200,30 @@ targets.on("change", () => {
 
 // --- layout
 
-const layouts = /** @type {const} */ ([
-  ["both", "Both"],
-  ["frame", "Frame"],
-  ["plan", "Orthorectified"],
+/** @typedef {"both" | "frame" | "plan"} Layout */
+
+const LAYOUTS = /** @type {{value: Layout, name: string}[]} */ ([
+  { value: "both", name: "Both" },
+  { value: "frame", name: "Frame" },
+  { value: "plan", name: "Orthorectified" },
 ]);
-/** @param {string} name */
-function setLayout(name) {
-  const chosen = layouts.some(([key]) => key === name) ? name : "both";
-  find("#panes").dataset.layout = chosen;
-  for (const button of find("#layout").querySelectorAll("button"))
-    button.setAttribute("aria-pressed", String(button.dataset.layout === chosen));
-  setView({ layout: chosen === "both" ? null : chosen });
+let layout = LAYOUTS.find(({ value }) => value === viewText("layout"))?.value ?? "both";
+const layouts = segmented({ label: "Pictures shown", choices: LAYOUTS, value: layout, onChange: setLayout });
+find("#layout").append(layouts.element);
+setLayout(layout);
+
+/** @param {Layout} wanted */
+function setLayout(wanted) {
+  layout = wanted;
+  layouts.set(wanted);
+  find("#panes").dataset.layout = wanted;
+  setView({ layout: wanted === "both" ? null : wanted });
 }
 
 function nextLayout() {
-  const at = layouts.findIndex(([key]) => key === find("#panes").dataset.layout);
-  setLayout(layouts[(at + 1) % layouts.length][0]);
+  const at = LAYOUTS.findIndex(({ value }) => value === layout);
+  setLayout(LAYOUTS[(at + 1) % LAYOUTS.length].value);
 }
-
-find("#layout").append(
-  ...layouts.map(([key, words]) =>
-    h("button", { type: "button", "data-layout": key, onclick: () => setLayout(key) }, words),
-  ),
-);
-setLayout(viewText("layout") ?? "both");
 
 // --- keys
 
