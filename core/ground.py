@@ -53,7 +53,7 @@ def choose_features(luma: Luma, moving_regions_px: Sequence[Sequence[tuple[float
     if len(points) < LEAST_POINTS:
         raise InputError(
             f"project.json: moving_regions_px leave only {len(points)} ground features in the reference frame; "
-            "draw them closer around what moves, or choose another reference_frame"
+            "draw them closer around what moves, or choose another reference_frame."
         )
     return points
 
@@ -69,7 +69,7 @@ def choose_features_within(luma: Luma, region_raw: Floats, count: int, name: str
     inside = cv2.erode(region, np.ones((2 * HALF_PX + 1, 2 * HALF_PX + 1), np.uint8)).astype(bool)
     points = _spread_corners(luma, inside & ground_mask(luma.shape, ()), count)
     if len(points) < 6:
-        raise InputError(f"{name}.region_m shows too little texture to follow; enlarge it, or mark lines instead")
+        raise InputError(f"{name}.region_m shows too little texture to follow; enlarge it, or mark lines instead.")
     return points
 
 

@@ -86,7 +86,7 @@ class SiftGround:
         if len(kept) < LEAST_MATCHES:
             raise InputError(
                 f"project.json: moving_regions_px leave only {len(kept)} SIFT features on the ground of the reference "
-                "frame; draw them closer around what moves, or choose another reference_frame"
+                "frame; draw them closer around what moves, or choose another reference_frame."
             )
         self._descriptors = descriptors[kept]
         self.points_raw = np.array([keypoints[i].pt for i in kept], dtype=np.float64)
@@ -215,7 +215,7 @@ class CannyLines:
             if count < LEAST_STATIONS:
                 raise InputError(
                     f"project.json: targets.{name}.lines.{line} holds no line with two edges in the reference frame; "
-                    "draw the band along a strip or joint that stands out from the roof"
+                    "draw the band along a strip or joint that stands out from the roof."
                 )
         rays = setup.lens.rays_from_raw(self.reference_raw.mean(axis=2))
         lines = [fit_line(points, np.ones(len(points)), self._centre) for points in rays]
@@ -255,7 +255,7 @@ def _lines_target(luma: Luma, target: Target, setup: MeasureSetup) -> CannyLines
     if target.lines is None or target.kind != "lines":
         raise InputError(
             f'project.json: targets.{target.name} is of kind "points", which method "paper" does not know; '
-            'choose "geometric", or mark lines'
+            'choose "geometric", or mark lines.'
         )
     return CannyLines(luma, [getattr(target.lines, name) for name in LINE_NAMES], setup, target.name)
 

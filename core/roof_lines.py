@@ -127,7 +127,7 @@ class LineTracker:
         self._half_band = max(6, int(np.ceil(width_px / 2)))
         section = self._section(luma, to_raw, self._half_band + 4)
         if section is None:
-            raise InputError(f"{name} lies outside the reference frame; move it onto the roof")
+            raise InputError(f"{name} lies outside the reference frame; move it onto the roof.")
         self.profile = _find_strip(section, self._half_band, name)
         context = (len(self.profile.signature) - 1) // 2
         self._reach = self._half_band + context + int(np.ceil(abs(self.profile.tilt_px))) + 1
@@ -296,7 +296,7 @@ def _find_strip(section: _Section, half_band: int, name: str) -> StripProfile:
     if best is None:
         raise InputError(
             f"{name} holds no line with two edges in the reference frame; draw the band along a strip or joint, "
-            "a few pixels wide, that stands out from the roof"
+            "a few pixels wide, that stands out from the roof."
         )
     _, offset, tilt, width, polarity, edge = best
     context = round(1.2 * width + 4)

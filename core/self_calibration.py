@@ -69,12 +69,15 @@ def self_calibrate(
     parameters: tuple[Parameter, ...],
     apparent_motion: Callable[[Floats], Floats],
     sigma_m: Floats,
+    ground_misfit: Callable[[Floats], Floats] | None = None,
 ) -> SelfCalibration:
     """Return the corrections under which the target stands still.
 
     Args:
         apparent_motion: leads from corrections (P,) to the target's coordinates (B, K) in B stationary moments, metres.
         sigma_m: (B, K) noise of these coordinates; nan where a moment is not to be used.
+        ground_misfit: leads from corrections to what the ground leaves over in the whole clip, in units of its noise:
+            the ground never moves, so a wrong lens shows wherever the view has turned far.
 
     Source: Gauss-Newton on the posterior; the priors make it a ridge regression with meaning.
     """
@@ -86,7 +89,8 @@ def self_calibrate(
         still = usable & np.isfinite(motion)
         weight = np.where(still, 1.0 / np.where(usable, sigma_m, 1.0) ** 2, 0.0)
         rest = (weight * np.nan_to_num(motion)).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
-        return np.asarray((np.where(still, motion - rest, 0.0) / np.where(usable, sigma_m, 1.0)).ravel())
+        own = (np.where(still, motion - rest, 0.0) / np.where(usable, sigma_m, 1.0)).ravel()
+        return own if ground_misfit is None else np.concatenate([own, ground_misfit(scaled * priors)])
 
     scaled = np.zeros(len(priors))
     before = misfit(scaled)
@@ -106,8 +110,8 @@ def self_calibrate(
         parameters=parameters,
         correction=scaled * priors,
         sigma=np.sqrt(np.diag(covariance)),
-        rms_before_m=float(np.sqrt(np.nanmean((before * scale) ** 2))),
-        rms_after_m=float(np.sqrt(np.nanmean((residual * scale) ** 2))),
+        rms_before_m=float(np.sqrt(np.nanmean((before[: scale.size] * scale) ** 2))),
+        rms_after_m=float(np.sqrt(np.nanmean((residual[: scale.size] * scale) ** 2))),
         covariance=covariance,
     )
 

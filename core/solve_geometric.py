@@ -34,6 +34,10 @@ LEAST_GROUND = 20
 # Stationary moments used for self-calibration, each the mean of the frames around it.
 MOMENTS = 48
 CALIBRATION_FEATURES = 230
+# Neighbouring ground features err alike, so that all together say less than their number promises.
+ALIKE = 5.0
+# The mean of neighbouring frames is not quite the view of their mean pose, however exact the patches are.
+LEAST_GROUND_NOISE_PX = 0.1
 # Parallax below which stationary frames say nothing about the calibration, in standard deviations of a moment.
 LEAST_DRIFT_M = 0.02
 # Uncertainty of a roof's height above the ground, one standard deviation: LiDAR, and where exactly the strip lies.
@@ -305,7 +309,9 @@ def _self_calibrated(
     motion = apparent_motion(np.zeros(len(parameters)))
     noise = 1.4826 * finite_median(np.abs(np.diff(motion, n=2, axis=0)).T) / np.sqrt(6.0)
     sigma = np.where(np.isfinite(motion), np.maximum(noise, LEAST_NOISE_M), np.nan)
-    return self_calibrate(parameters, apparent_motion, sigma)
+    return self_calibrate(
+        parameters, apparent_motion, sigma, _ground_misfit(recording, project, start, reference, relief)
+    )
 
 
 def _apparent_motion(
@@ -329,6 +335,29 @@ def _apparent_motion(
         return np.where(solved.usable[:, None], motion, np.nan)
 
     return apparent_motion
+
+
+def _ground_misfit(
+    recording: Recording, project: Project, start: _Calibration, reference: ReferenceFit, relief: Relief | None
+) -> Callable[[Floats], Floats]:
+    """Return a function from corrections of the calibration to what the ground leaves over in the whole clip."""
+    moments = _moments(recording, np.ones(len(recording.frame), dtype=bool))
+    elevation = click_elevation(project, relief)
+
+    def left_over(correction: Floats) -> tuple[Floats, Bools]:
+        used = _with_correction(start, correction, project)
+        pose0 = reference_pose(project.correspondences, used.lens, reference.origin_m, elevation)
+        solved = solve_ground(moments, used.lens, pose0, reference.origin_m, relief)
+        agree = (solved.weight > 0.1) & solved.usable[:, None]
+        residual = np.where(agree[..., None], solved.known_poses.residual, 0.0)
+        # What a feature leaves over in every frame alike is its own place, not the lens.
+        own = residual.sum(axis=0) / np.maximum(agree.sum(axis=0), 1)[:, None]
+        return np.where(agree[..., None], residual - own, 0.0), agree
+
+    first, agree = left_over(np.zeros(len(_parameters(start.lens, project))))
+    noise = ALIKE * 1.4826 * float(np.median(np.abs(first[agree]))) if agree.any() else 1.0
+    noise = max(noise, LEAST_GROUND_NOISE_PX / float(start.lens.focal_px.mean()))
+    return lambda correction: left_over(correction)[0].ravel() / noise
 
 
 def _calibration_sigma(
