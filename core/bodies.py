@@ -10,7 +10,7 @@ from core.camera import Pose, PoseFit, intersect_height
 from core.coordinates import Bools, Floats
 from core.lens import Lens
 from core.measurements import Recording
-from core.motion import LineSet, RigidFit, fit_line, rigid_from_lines, rigid_from_points
+from core.motion import LineSet, RigidFit, fit_line, rigid_from_lines, rigid_from_points, rigid_with_weights
 
 
 def world_points(raw: Floats, lens: Lens, poses: PoseFit | Pose, z_m: float) -> Floats:
@@ -53,6 +53,12 @@ class RestBody:
         seen = np.isfinite(residual).sum(axis=0) >= 5
         pattern = np.where(seen, np.nanmedian(np.where(seen, residual, 0.0), axis=0), 0.0)
         return rigid_from_lines(points, weight, self.lines, pattern=np.nan_to_num(pattern))
+
+    def fit_with(self, points: Floats, weight: Floats) -> RigidFit:
+        """Return the motion of F frames from points weighted as given; smooth in the points."""
+        at_rest = self.points if self.lines is None else self.lines
+        assert at_rest is not None
+        return rigid_with_weights(points, weight, at_rest, self.centre)
 
 
 def midpoints(raw: Floats) -> Floats:

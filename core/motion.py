@@ -15,6 +15,8 @@ from core.coordinates import Bools, Floats, finite_median, finite_rows
 # Tukey's biweight at 95 % efficiency under normal noise (Holland & Welsch 1977).
 TUKEY = 4.685
 ITERATIONS = 8
+# Plain Gauss-Newton doubles the right digits each time; rotations are fractions of a degree.
+PLAIN_ITERATIONS = 4
 
 
 @dataclass(frozen=True)
@@ -234,6 +236,33 @@ def _line_residual(x: Floats, shift: Floats, angle: Floats, normal: Floats, targ
     J[..., 1] = turned_v[..., None]
     J[..., 2] = turned_v[..., None] * moved[..., 0] - turned_u[..., None] * moved[..., 1]
     return distance - target, J
+
+
+def rigid_with_weights(points: Floats, weight: Floats, at_rest: LineSet | Floats, centre: Floats) -> RigidFit:
+    """Return the rigid motion by plain least squares with weights that are given, such as those of an earlier fit.
+
+    Unlike the robust fits it depends smoothly on the points, as derivatives need.
+
+    Args:
+        points: (F, L, K, 2) of lines or (F, N, 2), nan where not measured.
+        weight: (F, L, K) or (F, N), inverse variances.
+        at_rest: the L lines, or the N points (N, 2).
+    """
+    seen = finite_rows(points) & (weight > 0)
+    x = np.where(seen[..., None], points - centre, 0.0)
+    used = np.where(seen, weight, 0.0)
+    shift, angle, normal = np.zeros((len(points), 2)), np.zeros(len(points)), np.zeros((len(points), 3, 3))
+    residual, spread = np.zeros(used.shape), used
+    for _ in range(PLAIN_ITERATIONS):
+        if isinstance(at_rest, LineSet):
+            target = np.broadcast_to(at_rest.offset[:, None], used.shape[1:])
+            residual, J = _line_residual(x, shift, angle, at_rest.normal, target)
+        else:
+            residual, J = _point_residual(x, shift, angle, at_rest - centre)
+            spread = np.repeat(used[..., None], 2, axis=-1)
+        normal, step = _gauss_newton(J, residual, spread)
+        shift, angle = shift + step[:, :2], angle + step[:, 2]
+    return RigidFit(shift, angle, residual, used, normal, np.ones((len(points), 1)))
 
 
 def rigid_from_points(

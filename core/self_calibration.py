@@ -16,7 +16,7 @@ from core.coordinates import Floats
 
 # Corrections beyond this many priors mean that something else is wrong: another lens, another height.
 SUSPICIOUS = 3.0
-ITERATIONS = 4
+ITERATIONS = 5
 
 
 @dataclass(frozen=True)

@@ -305,7 +305,7 @@ def _self_calibrated(
     drift = ground.known_poses.centre_m[ground.usable].std(axis=0)[:2] if ground.usable.any() else np.zeros(2)
     if float(np.hypot(*drift)) < LEAST_DRIFT_M:
         return refused(parameters, f"the camera drifted by {np.hypot(*drift) * 100:.1f} cm only, too little to tell")
-    apparent_motion = _apparent_motion(moments, project, start, reference, relief)
+    apparent_motion = _Trials(moments, project, start, reference, relief).motion
     motion = apparent_motion(np.zeros(len(parameters)))
     noise = 1.4826 * finite_median(np.abs(np.diff(motion, n=2, axis=0)).T) / np.sqrt(6.0)
     sigma = np.where(np.isfinite(motion), np.maximum(noise, LEAST_NOISE_M), np.nan)
@@ -314,42 +314,76 @@ def _self_calibrated(
     )
 
 
-def _apparent_motion(
-    moments: Recording, project: Project, start: _Calibration, reference: ReferenceFit, relief: Relief | None
-) -> Callable[[Floats], Floats]:
-    """Return a function from corrections of the calibration to P1 and P2 of every target, (moments, 4 targets)."""
-    elevation = click_elevation(project, relief)
+@dataclass(frozen=True)
+class _Trial:
+    """A calibration tried on moments: poses and points of the ground, as one set of weights makes them."""
 
-    def apparent_motion(correction: Floats) -> Floats:
-        used = _with_correction(start, correction, project)
-        pose0 = reference_pose(project.correspondences, used.lens, reference.origin_m, elevation)
-        solved = solve_ground(moments, used.lens, pose0, reference.origin_m, relief)
-        columns = []
+    used: _Calibration
+    pose0: Pose
+    ground: PoseFit
+
+
+class _Trials:
+    """Tries calibrations on a few moments of a recording.
+
+    Who counts as an outlier is decided once, under the calibration as it came: a weight that flips between two trials
+    would pass for an effect of the calibration.
+    """
+
+    def __init__(
+        self, moments: Recording, project: Project, start: _Calibration, reference: ReferenceFit, relief: Relief | None
+    ) -> None:
+        self._moments, self._project, self._start = moments, project, start
+        self._origin_m, self._relief = reference.origin_m, relief
+        self._elevation = click_elevation(project, relief)
+        solved = solve_ground(moments, start.lens, start.pose0, reference.origin_m, relief)
+        self._first = solved.known_poses
+        self.usable = solved.usable
+        self._weights = {}
         for target in project.targets:
-            height = used.heights_m[target.name]
-            body = rest_body(moments, target.name, used.lens, pose0, height)
-            points = world_points(midpoints(moments.targets_raw[target.name]), used.lens, solved.known_poses, height)
-            fit = body.fit(points, np.zeros(len(points), dtype=bool))
-            columns += [fit.at(place, body.centre) for place in body.places]
-        motion = np.concatenate(columns, axis=1)
-        return np.where(solved.usable[:, None], motion, np.nan)
+            height = start.heights_m[target.name]
+            body = rest_body(moments, target.name, start.lens, start.pose0, height)
+            fit = body.fit(self._points(target, start.lens, self._first, height), np.zeros(len(moments.frame), bool))
+            sigma = np.maximum(finite_median(fit.sigma.T), 1e-6)
+            self._weights[target.name] = fit.weight / (sigma[:, None] if body.lines is not None else sigma) ** 2
 
-    return apparent_motion
+    def attempt(self, correction: Floats) -> _Trial:
+        """Return the poses of all moments under a correction (P,)."""
+        used = _with_correction(self._start, correction, self._project)
+        pose0 = reference_pose(self._project.correspondences, used.lens, self._origin_m, self._elevation)
+        points = ground_points(self._moments.reference.ground_raw, used.lens, pose0, self._origin_m, self._relief)
+        rays = used.lens.rays_from_raw(self._moments.ground_raw)
+        weight = np.where(np.isfinite(points).all(axis=1), self._first.weight, 0.0)
+        ground = fit_poses(rays, weight, np.nan_to_num(points), self._first, iterations=5, robust=False)
+        return _Trial(used, pose0, ground)
+
+    def motion(self, correction: Floats) -> Floats:
+        """Return P1 and P2 of every target (moments, 4 targets), metres, under a correction (P,)."""
+        trial = self.attempt(correction)
+        columns = []
+        for target in self._project.targets:
+            height = trial.used.heights_m[target.name]
+            body = rest_body(self._moments, target.name, trial.used.lens, trial.pose0, height)
+            points = self._points(target, trial.used.lens, trial.ground, height)
+            fit = body.fit_with(points, self._weights[target.name])
+            measured = (self.usable & is_determined(fit.normal))[:, None]
+            columns += [np.where(measured, fit.at(place, body.centre), np.nan) for place in body.places]
+        return np.concatenate(columns, axis=1)
+
+    def _points(self, target: Target, lens: Lens, ground: PoseFit, height_m: float) -> Floats:
+        return world_points(midpoints(self._moments.targets_raw[target.name]), lens, ground, height_m)
 
 
 def _ground_misfit(
     recording: Recording, project: Project, start: _Calibration, reference: ReferenceFit, relief: Relief | None
 ) -> Callable[[Floats], Floats]:
     """Return a function from corrections of the calibration to what the ground leaves over in the whole clip."""
-    moments = _moments(recording, np.ones(len(recording.frame), dtype=bool))
-    elevation = click_elevation(project, relief)
+    trials = _Trials(_moments(recording, np.ones(len(recording.frame), bool)), project, start, reference, relief)
 
     def left_over(correction: Floats) -> tuple[Floats, Bools]:
-        used = _with_correction(start, correction, project)
-        pose0 = reference_pose(project.correspondences, used.lens, reference.origin_m, elevation)
-        solved = solve_ground(moments, used.lens, pose0, reference.origin_m, relief)
-        agree = (solved.weight > 0.1) & solved.usable[:, None]
-        residual = np.where(agree[..., None], solved.known_poses.residual, 0.0)
+        ground = trials.attempt(correction).ground
+        agree = (ground.weight > 0.1) & trials.usable[:, None]
+        residual = np.where(agree[..., None], ground.residual, 0.0)
         # What a feature leaves over in every frame alike is its own place, not the lens.
         own = residual.sum(axis=0) / np.maximum(agree.sum(axis=0), 1)[:, None]
         return np.where(agree[..., None], residual - own, 0.0), agree
@@ -374,7 +408,7 @@ def _calibration_sigma(
     """
     chosen = np.unique(np.linspace(0, len(recording.frame) - 1, MOMENTS).astype(int))
     some = _selected(_thinned(recording), chosen)
-    apparent_motion = _apparent_motion(some, project, start, reference, relief)
+    apparent_motion = _Trials(some, project, start, reference, relief).motion
     motion = apparent_motion(calibration.correction)
     steps = 0.5 * np.array([parameter.sigma for parameter in calibration.parameters])
     J = np.stack([(apparent_motion(calibration.correction + d) - motion) for d in np.diag(steps)], -1) / steps
