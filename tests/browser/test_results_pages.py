@@ -295,6 +295,7 @@ def test_the_interval_of_rest_is_dragged_on_the_plot(browser, project):
     folder, pages = project
     with watched(browser, pages) as page:
         page.goto(f"{pages}/drift")
+        expect(page.locator(".drift-main .plot-legend")).to_contain_text("Raw")
         area = page.locator(".drift-main .u-over").bounding_box()
         with page.expect_response(re.compile(r"/drift/sweep")):
             page.mouse.move(area["x"] + 0.05 * area["width"], area["y"] + 60)

@@ -60,7 +60,8 @@ function showPixels(plot, left, right) {
 
 /** @param {Plot} plot @param {PointerEvent} event */
 function press(plot, event) {
-  if (event.button > 1 || !plot.u.over.contains(/** @type {Node} */ (event.target))) return;
+  const nothing = (plot.data[0]?.length ?? 0) === 0;
+  if (nothing || event.button > 1 || !plot.u.over.contains(/** @type {Node} */ (event.target))) return;
   const own = plot.options.drag ?? "view";
   const other = own === "seek" ? "select" : "seek";
   const action = event.button === 1 || event.altKey ? "view" : event.shiftKey && own !== "view" ? other : own;
