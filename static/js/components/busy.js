@@ -10,7 +10,11 @@ const SHOWN_AFTER_MS = 250; // what is quick needs no words
  * @returns {() => void} takes them away
  */
 export function busyOver(element, words) {
-  const cover = h("div", { class: "busy", role: "status" }, h("p", {}, h("span", { class: "busy-sign", "aria-hidden": "true" }), words));
+  const cover = h(
+    "div",
+    { class: "busy", role: "status" },
+    h("p", {}, h("span", { class: "busy-sign", "aria-hidden": "true" }), words),
+  );
   const timer = window.setTimeout(() => element.append(cover), SHOWN_AFTER_MS);
   return () => {
     window.clearTimeout(timer);

@@ -25,12 +25,49 @@ export class ExclusionEditor {
     this.onJump = onJump;
     this.list = h("div", { class: "run-list" });
     this.form = h("div", { class: "exclusion-form" });
-    this.first = numberField({ label: "From frame", unit: "", value: 0, decimals: 0, step: 1, min: 0, compact: true, onChange: (value) => this.#change(value ?? 0, this.selection?.[1] ?? 0) });
-    this.last = numberField({ label: "To frame", unit: "", value: 0, decimals: 0, step: 1, min: 0, compact: true, onChange: (value) => this.#change(this.selection?.[0] ?? 0, value ?? 0) });
+    this.first = numberField({
+      label: "From frame",
+      unit: "",
+      value: 0,
+      decimals: 0,
+      step: 1,
+      min: 0,
+      compact: true,
+      onChange: (value) => this.#change(value ?? 0, this.selection?.[1] ?? 0),
+    });
+    this.last = numberField({
+      label: "To frame",
+      unit: "",
+      value: 0,
+      decimals: 0,
+      step: 1,
+      min: 0,
+      compact: true,
+      onChange: (value) => this.#change(this.selection?.[0] ?? 0, value ?? 0),
+    });
     this.button = h("button", { type: "button", class: "button small", onclick: () => this.exclude(0) });
-    const forget = h("button", { type: "button", class: "button quiet small icon-only", "aria-label": "Forget the selection", onclick: () => this.forget() }, icon("close", "small"));
-    fill(this.form, h("div", { class: "field-row" }, this.first.element, this.last.element), h("div", { class: "toolbar" }, this.button, forget));
-    fill(host, h("header", {}, h("h2", {}, "Excluded frames")), this.list, this.form, (this.hint = h("p", { class: "small faint" })));
+    const forget = h(
+      "button",
+      {
+        type: "button",
+        class: "button quiet small icon-only",
+        "aria-label": "Forget the selection",
+        onclick: () => this.forget(),
+      },
+      icon("close", "small"),
+    );
+    fill(
+      this.form,
+      h("div", { class: "field-row" }, this.first.element, this.last.element),
+      h("div", { class: "toolbar" }, this.button, forget),
+    );
+    fill(
+      host,
+      h("header", {}, h("h2", {}, "Excluded frames")),
+      this.list,
+      this.form,
+      (this.hint = h("p", { class: "small faint" })),
+    );
   }
 
   /** @type {HTMLElement} */
@@ -97,11 +134,16 @@ export class ExclusionEditor {
 
   show() {
     const ranges = this.store.project.excluded_frames;
-    fill(this.list, ranges.map((range) => this.#row(range)));
+    fill(
+      this.list,
+      ranges.map((range) => this.#row(range)),
+    );
     this.list.hidden = ranges.length === 0;
     this.form.hidden = this.selection === null;
     this.hint.hidden = this.selection !== null;
-    this.hint.textContent = ranges.length ? "Shift+drag on a plot selects more." : "None. Shift+drag on a plot, or [ and ], selects frames; X excludes them.";
+    this.hint.textContent = ranges.length
+      ? "Shift+drag on a plot selects more."
+      : "None. Shift+drag on a plot, or [ and ], selects frames; X excludes them.";
     if (this.selection === null) return;
     this.first.set(this.selection[0]);
     this.last.set(this.selection[1]);
@@ -113,10 +155,28 @@ export class ExclusionEditor {
   #row(range) {
     const [first] = range;
     const seconds = `${fixed(this.#times_s[first], 2)} s`;
-    return h("div", { class: "run-row" },
-      h("button", { type: "button", class: "run-jump", onclick: () => this.onJump(first) },
-        h("span", { class: "status-key excluded" }), h("span", { class: "number" }, rangeText(range)), h("span", { class: "number faint end" }, seconds)),
-      h("button", { type: "button", class: "button quiet small icon-only", "aria-label": `Take back ${rangeWords(range)}`, title: "Take back", onclick: () => this.#takeBack(range) }, icon("undo", "small")));
+    return h(
+      "div",
+      { class: "run-row" },
+      h(
+        "button",
+        { type: "button", class: "run-jump", onclick: () => this.onJump(first) },
+        h("span", { class: "status-key excluded" }),
+        h("span", { class: "number" }, rangeText(range)),
+        h("span", { class: "number faint end" }, seconds),
+      ),
+      h(
+        "button",
+        {
+          type: "button",
+          class: "button quiet small icon-only",
+          "aria-label": `Take back ${rangeWords(range)}`,
+          title: "Take back",
+          onclick: () => this.#takeBack(range),
+        },
+        icon("undo", "small"),
+      ),
+    );
   }
 }
 

@@ -45,7 +45,11 @@ export class FrameView extends Emitter {
     this.painter = new PointPainter(this.pane);
     this.loupe = new Loupe(this.pane);
     this.loupeButton = this.#tool("target", "Loupe (Z)", () => this.toggleLoupe());
-    const tools = [this.loupeButton, this.#tool("zoom_in", "Zoom in (+)", () => this.pane.zoom(1.4)), this.#tool("fit", "Whole picture (0)", () => this.pane.fit())];
+    const tools = [
+      this.loupeButton,
+      this.#tool("zoom_in", "Zoom in (+)", () => this.pane.zoom(1.4)),
+      this.#tool("fit", "Whole picture (0)", () => this.pane.fit()),
+    ];
     this.chip = h("span", { class: "pane-chip" });
     element.append(h("div", { class: "pane-caption" }, this.chip), h("div", { class: "pane-tools" }, tools));
     this.#setLoupe();
@@ -115,12 +119,19 @@ export class FrameView extends Emitter {
     }
     this.#loading = false;
     const steps = this.playing ? PREPARED_BY_PLAYING : PREPARED_BY_STEPPING;
-    this.library.prepare(steps.map((by) => this.#wanted + by), this.#next().width, this.method);
+    this.library.prepare(
+      steps.map((by) => this.#wanted + by),
+      this.#next().width,
+      this.method,
+    );
   }
 
   /** @param {{frame: number, width: number | null, key: string}} next */
   async #showOne({ frame, width, key }) {
-    const [image, review] = await Promise.all([this.library.image(frame, width), this.library.review(frame, this.method)]);
+    const [image, review] = await Promise.all([
+      this.library.image(frame, width),
+      this.library.review(frame, this.method),
+    ]);
     this.pane.setImage(image);
     this.#shown = key;
     this.review = review;

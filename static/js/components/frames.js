@@ -99,7 +99,9 @@ export class FrameLibrary {
 
   /** @param {number} frame @param {string} method @returns {Promise<FrameReview>} */
   review(frame, method) {
-    return this.#reviews.get(`${frame}/${method}`, () => get(projectPath(this.projectId, `review/${frame}`, { method })));
+    return this.#reviews.get(`${frame}/${method}`, () =>
+      get(projectPath(this.projectId, `review/${frame}`, { method })),
+    );
   }
 
   /** Fetch in advance; failures are told when the frame is asked for. @param {number[]} frames @param {number | null} width @param {string} method */

@@ -40,8 +40,16 @@ import { get, projectPath } from "../lib/api.js";
 
 /** @type {{value: Method, name: string, line: string}[]} */
 export const METHODS = [
-  { value: "geometric", name: "Geometric", line: "Camera pose of every frame from the tracked ground, roof lines cut at the roof's own height: no parallax, no filter, the residual stays." },
-  { value: "paper", name: "Paper", line: "The published method: ground homography, scale from P1–P2, high-pass against the drift that is left. Needs no lens and no height." },
+  {
+    value: "geometric",
+    name: "Geometric",
+    line: "Camera pose of every frame from the tracked ground, roof lines cut at the roof's own height: no parallax, no filter, the residual stays.",
+  },
+  {
+    value: "paper",
+    name: "Paper",
+    line: "The published method: ground homography, scale from P1–P2, high-pass against the drift that is left. Needs no lens and no height.",
+  },
 ];
 
 /** @param {string} method */
@@ -67,5 +75,10 @@ export async function fetchHistory(id, target, method) {
 /** Per frame the worst status of several targets. @param {string[][]} lists @returns {string[]} */
 export function worstStatuses(lists) {
   const [first = [], ...others] = lists;
-  return first.map((status, i) => others.reduce((worst, list) => (STATUS_ORDER.indexOf(list[i]) > STATUS_ORDER.indexOf(worst) ? list[i] : worst), status));
+  return first.map((status, i) =>
+    others.reduce(
+      (worst, list) => (STATUS_ORDER.indexOf(list[i]) > STATUS_ORDER.indexOf(worst) ? list[i] : worst),
+      status,
+    ),
+  );
 }

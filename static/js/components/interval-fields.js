@@ -29,14 +29,38 @@ export function intervalFields(host, onChange) {
       onChange(name, wanted[0] < wanted[1] ? wanted : [Math.min(...wanted), Math.max(...wanted) + 0.1]);
     };
     const field = (/** @type {0 | 1} */ end) =>
-      numberField({ label: `${label} ${end === 0 ? "from" : "to"}`, unit: "s", value: null, decimals: 2, step: 0.1, min: 0, optional: true, compact: true, bare: true, onChange: change(end) });
+      numberField({
+        label: `${label} ${end === 0 ? "from" : "to"}`,
+        unit: "s",
+        value: null,
+        decimals: 2,
+        step: 0.1,
+        min: 0,
+        optional: true,
+        compact: true,
+        bare: true,
+        onChange: change(end),
+      });
     const [from, to] = [field(0), field(1)];
     const key = h("span", { class: "interval-key", "aria-hidden": "true" });
     key.style.background = `var(${colour})`;
-    const element = h("div", { class: "interval-row" }, h("span", { title: hint }, key, label), from.element, to.element);
+    const element = h(
+      "div",
+      { class: "interval-row" },
+      h("span", { title: hint }, key, label),
+      from.element,
+      to.element,
+    );
     return { name, from, to, element };
   });
-  fill(host, h("div", { class: "interval-rows" }, rows.map((row) => row.element)));
+  fill(
+    host,
+    h(
+      "div",
+      { class: "interval-rows" },
+      rows.map((row) => row.element),
+    ),
+  );
   return {
     /** @param {import("../lib/types.js").Project["intervals_s"]} intervals */
     show(intervals) {

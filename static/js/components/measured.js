@@ -31,8 +31,11 @@ export async function whenMeasured(page, what) {
 
 /** @param {string} id @param {string} what */
 function emptyState(id, what) {
-  return h("div", { class: "empty-state" },
+  return h(
+    "div",
+    { class: "empty-state" },
     h("h1", {}, "Nothing measured yet"),
     h("p", {}, what),
-    h("a", { class: "button primary", href: stepUrl(id, "track") }, "Go to Track", icon("arrow_right")));
+    h("a", { class: "button primary", href: stepUrl(id, "track") }, "Go to Track", icon("arrow_right")),
+  );
 }

@@ -6,4 +6,5 @@ import { icon } from "../lib/icons.js";
 const ICONS = /** @type {const} */ ({ good: "check", info: "info", warn: "warn", bad: "warn" });
 
 /** @param {"info" | "good" | "warn" | "bad"} tone @param {string} words */
-export const note = (tone, words) => h("div", { class: `note ${tone}`, role: tone === "bad" ? "alert" : null }, icon(ICONS[tone]), h("p", {}, words));
+export const note = (tone, words) =>
+  h("div", { class: `note ${tone}`, role: tone === "bad" ? "alert" : null }, icon(ICONS[tone]), h("p", {}, words));

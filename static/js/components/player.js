@@ -28,8 +28,22 @@ export class Player extends Emitter {
     this.statuses = [];
     this.frame = 0;
     this.speed = 1;
-    this.playButton = h("button", { type: "button", class: "button icon-only", "aria-label": "Play", onclick: () => this.toggle() });
-    this.scrubber = h("input", { type: "range", class: "player-scrubber", min: 0, max: 0, step: 1, value: 0, "aria-label": "Frame", oninput: () => this.go(Number(this.scrubber.value)) });
+    this.playButton = h("button", {
+      type: "button",
+      class: "button icon-only",
+      "aria-label": "Play",
+      onclick: () => this.toggle(),
+    });
+    this.scrubber = h("input", {
+      type: "range",
+      class: "player-scrubber",
+      min: 0,
+      max: 0,
+      step: 1,
+      value: 0,
+      "aria-label": "Frame",
+      oninput: () => this.go(Number(this.scrubber.value)),
+    });
     this.readout = h("output", { class: "player-readout number" });
     this.element = h("div", { class: "player", role: "group", "aria-label": "Frame player" }, this.#controls());
     host.append(this.element);
@@ -73,8 +87,11 @@ export class Player extends Emitter {
   /** To the beginning of the next run of weak or lost frames. @param {1 | -1} direction @returns {boolean} whether there is one */
   jump(direction) {
     this.pause();
-    const starts = this.statuses.flatMap((status, i) => (isDoubtful(status) && status !== this.statuses[i - 1] ? [i] : []));
-    const wanted = direction > 0 ? starts.find((start) => start > this.frame) : starts.findLast((start) => start < this.frame);
+    const starts = this.statuses.flatMap((status, i) =>
+      isDoubtful(status) && status !== this.statuses[i - 1] ? [i] : [],
+    );
+    const wanted =
+      direction > 0 ? starts.find((start) => start > this.frame) : starts.findLast((start) => start < this.frame);
     if (wanted !== undefined) this.go(wanted);
     return wanted !== undefined;
   }
@@ -122,20 +139,36 @@ export class Player extends Emitter {
     this.playButton.setAttribute("aria-label", this.playing ? "Pause" : "Play");
     this.scrubber.value = String(this.frame);
     this.scrubber.setAttribute("aria-valuetext", `frame ${this.frame}, ${this.time_s.toFixed(3)} seconds, ${status}`);
-    fill(this.readout, h("b", {}, fixed(this.time_s, 3)), " s", h("span", { class: "faint" }, `frame ${this.frame} / ${Math.max(this.times_s.length - 1, 0)}`));
+    fill(
+      this.readout,
+      h("b", {}, fixed(this.time_s, 3)),
+      " s",
+      h("span", { class: "faint" }, `frame ${this.frame} / ${Math.max(this.times_s.length - 1, 0)}`),
+    );
   }
 
   #controls() {
     const button = (/** @type {string} */ label, /** @type {string} */ path, /** @type {() => void} */ run) =>
-      h("button", { type: "button", class: "button quiet icon-only", "aria-label": label, title: label, onclick: run }, transportIcon(path));
-    const speed = h("select", { class: "input player-speed", "aria-label": "Speed", onchange: () => this.#changeSpeed(Number(speed.value)) },
-      SPEEDS.map((value) => h("option", { value, selected: value === 1 }, `${value}×`)));
+      h(
+        "button",
+        { type: "button", class: "button quiet icon-only", "aria-label": label, title: label, onclick: run },
+        transportIcon(path),
+      );
+    const speed = h(
+      "select",
+      { class: "input player-speed", "aria-label": "Speed", onchange: () => this.#changeSpeed(Number(speed.value)) },
+      SPEEDS.map((value) => h("option", { value, selected: value === 1 }, `${value}×`)),
+    );
     return [
-      button("Previous weak or lost frame", "M8.500 3.500 4.500 8l4 4.500M13 3.500 9 8l4 4.500M2.500 3.500v9", () => this.jump(-1)),
+      button("Previous weak or lost frame", "M8.500 3.500 4.500 8l4 4.500M13 3.500 9 8l4 4.500M2.500 3.500v9", () =>
+        this.jump(-1),
+      ),
       button("One frame back", "M11 3.500 5.500 8l5.500 4.500M3.500 3.500v9", () => this.step(-1)),
       this.playButton,
       button("One frame on", "M5 3.500 10.500 8 5 12.500M12.500 3.500v9", () => this.step(1)),
-      button("Next weak or lost frame", "M3 3.500 7 8l-4 4.500M7.500 3.500l4 4.500-4 4.500M13.500 3.500v9", () => this.jump(1)),
+      button("Next weak or lost frame", "M3 3.500 7 8l-4 4.500M7.500 3.500l4 4.500-4 4.500M13.500 3.500v9", () =>
+        this.jump(1),
+      ),
       this.scrubber,
       this.readout,
       speed,
@@ -150,7 +183,8 @@ export class Player extends Emitter {
 }
 
 /** @param {string} path */
-const transportIcon = (path) => svg("svg", { class: "icon", viewBox: "0 0 16 16", "aria-hidden": "true" }, svg("path", { d: path }));
+const transportIcon = (path) =>
+  svg("svg", { class: "icon", viewBox: "0 0 16 16", "aria-hidden": "true" }, svg("path", { d: path }));
 
 /** @param {string} status */
 export const isDoubtful = (status) => status === "weak" || status === "lost";

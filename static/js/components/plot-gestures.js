@@ -78,7 +78,8 @@ function press(plot, event) {
     plot.body.removeEventListener("pointercancel", end);
     plot.u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
     if (!start.moved && action !== "seek") plot.emit("seek", { x: start.x });
-    if (start.moved && action === "select" && now.type === "pointerup") emitSelection(plot, start.x, valueAt(plot, now));
+    if (start.moved && action === "select" && now.type === "pointerup")
+      emitSelection(plot, start.x, valueAt(plot, now));
   };
   plot.body.addEventListener("pointermove", move);
   plot.body.addEventListener("pointerup", end);

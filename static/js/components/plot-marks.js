@@ -84,7 +84,9 @@ export function drawVerticals(plot, u) {
     g.lineTo(x, top + height);
     g.stroke();
     const wide = g.measureText(vertical.label).width + 8 * scale;
-    const neighbour = plot.verticals.some((other) => other.at > vertical.at && u.valToPos(other.at, "x", true) < x + wide);
+    const neighbour = plot.verticals.some(
+      (other) => other.at > vertical.at && u.valToPos(other.at, "x", true) < x + wide,
+    );
     const after = (x + wide < left + width && !neighbour) || x - wide < left;
     g.fillText(vertical.label, after ? x + 6 * scale : x - wide + 2 * scale, top + 5 * scale);
   });
@@ -217,7 +219,12 @@ export class IntervalHandles {
     handle.addEventListener("pointermove", (event) => {
       if (!handle.hasPointerCapture(event.pointerId)) return;
       event.stopPropagation();
-      this.move(key, end, this.plot.u.posToVal(event.clientX - this.plot.u.over.getBoundingClientRect().left, "x"), false);
+      this.move(
+        key,
+        end,
+        this.plot.u.posToVal(event.clientX - this.plot.u.over.getBoundingClientRect().left, "x"),
+        false,
+      );
     });
     handle.addEventListener("pointerup", (event) => {
       event.stopPropagation();
@@ -230,7 +237,12 @@ export class IntervalHandles {
 
   /** @param {KeyboardEvent} event @param {string} key @param {"from"|"to"} end */
   key(event, key, end) {
-    const direction = /** @type {Record<string, number>} */ ({ ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 })[event.key];
+    const direction = /** @type {Record<string, number>} */ ({
+      ArrowLeft: -1,
+      ArrowDown: -1,
+      ArrowRight: 1,
+      ArrowUp: 1,
+    })[event.key];
     if (!direction) return;
     event.preventDefault();
     event.stopPropagation();
@@ -247,12 +259,14 @@ export class IntervalHandles {
   move(key, end, x, done) {
     const [low, high] = this.plot.whole;
     const least = 0.02;
-    this.plot.setIntervals(this.plot.intervals.map((interval) => {
-      if (interval.key !== key) return interval;
-      const from = end === "from" ? Math.min(Math.max(x, low), interval.to - least) : interval.from;
-      const to = end === "to" ? Math.max(Math.min(x, high), interval.from + least) : interval.to;
-      this.plot.emit("interval", { key, from, to, done });
-      return { ...interval, from, to };
-    }));
+    this.plot.setIntervals(
+      this.plot.intervals.map((interval) => {
+        if (interval.key !== key) return interval;
+        const from = end === "from" ? Math.min(Math.max(x, low), interval.to - least) : interval.from;
+        const to = end === "to" ? Math.max(Math.min(x, high), interval.from + least) : interval.to;
+        this.plot.emit("interval", { key, from, to, done });
+        return { ...interval, from, to };
+      }),
+    );
   }
 }

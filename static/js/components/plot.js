@@ -74,8 +74,20 @@ export class Plot extends Emitter {
     /** @type {Map<string, string>} */ this.colours = new Map();
     this.legend = h("span", { class: "plot-legend", role: "group", "aria-label": "Curves" });
     this.unitLabel = h("span", { class: "plot-unit" });
-    this.body = h("div", { class: "plot-body", tabindex: 0, role: "group", "aria-roledescription": "plot", "aria-label": options.title });
-    const head = h("figcaption", { class: "plot-head" }, h("span", { class: "plot-title" }, options.title), this.unitLabel, this.legend);
+    this.body = h("div", {
+      class: "plot-body",
+      tabindex: 0,
+      role: "group",
+      "aria-roledescription": "plot",
+      "aria-label": options.title,
+    });
+    const head = h(
+      "figcaption",
+      { class: "plot-head" },
+      h("span", { class: "plot-title" }, options.title),
+      this.unitLabel,
+      this.legend,
+    );
     this.root = h("figure", { class: "plot" }, head, this.body);
     host.append(this.root);
     this.playHead = h("div", { class: "plot-playhead" });
@@ -205,8 +217,16 @@ export class Plot extends Emitter {
       height: Math.max(this.body.clientHeight, 40),
       padding: [8, 20, 0, 0],
       legend: { show: false },
-      cursor: { drag: { x: false, y: false, setScale: false }, y: false, points: { size: 6 }, ...(link && { sync: { key: link } }) },
-      scales: { x: { time: false, distr: logX ? 3 : 1, range: () => this.shownX }, y: { distr: logY ? 3 : 1, range: (_, low, high) => this.rangeY(low, high) } },
+      cursor: {
+        drag: { x: false, y: false, setScale: false },
+        y: false,
+        points: { size: 6 },
+        ...(link && { sync: { key: link } }),
+      },
+      scales: {
+        x: { time: false, distr: logX ? 3 : 1, range: () => this.shownX },
+        y: { distr: logY ? 3 : 1, range: (_, low, high) => this.rangeY(low, high) },
+      },
       axes: [this.axisX(), this.axisY()],
       series: [{}, ...this.traces.map((trace) => this.series(trace))],
       hooks: {
@@ -224,14 +244,32 @@ export class Plot extends Emitter {
     const unit = this.options.xUnit ?? "s";
     const values = (/** @type {uPlot} */ _, /** @type {number[]} */ ticks) =>
       ticks.map((tick, i) => (tick == null ? "" : i === ticks.length - 1 ? `${round(tick)} ${unit}` : round(tick)));
-    return { stroke: ink, size: 30, gap: 4, font: AXIS_FONT, space: 64, grid: this.grid(), ticks: { show: false }, values };
+    return {
+      stroke: ink,
+      size: 30,
+      gap: 4,
+      font: AXIS_FONT,
+      space: 64,
+      grid: this.grid(),
+      ticks: { show: false },
+      values,
+    };
   }
 
   /** @returns {uPlot.Axis} */
   axisY() {
     const values = (/** @type {uPlot} */ _, /** @type {number[]} */ ticks) =>
       ticks.map((tick) => (tick == null ? "" : round(tick * this.written.factor).replace("-", "−")));
-    return { stroke: () => this.colour("--plot-axis"), size: 48, gap: 6, font: AXIS_FONT, space: 28, grid: this.grid(), ticks: { show: false }, values };
+    return {
+      stroke: () => this.colour("--plot-axis"),
+      size: 48,
+      gap: 6,
+      font: AXIS_FONT,
+      space: 28,
+      grid: this.grid(),
+      ticks: { show: false },
+      values,
+    };
   }
 
   /** @returns {uPlot.Axis.Grid} */
@@ -272,13 +310,17 @@ export class Plot extends Emitter {
   /** @param {[number, number]} range */
   chooseUnit([low, high]) {
     if (this.options.unit !== "m") return;
-    this.written = Math.max(Math.abs(low), Math.abs(high)) < 0.06 ? { factor: 1000, unit: "mm" } : { factor: 100, unit: "cm" };
+    this.written =
+      Math.max(Math.abs(low), Math.abs(high)) < 0.06 ? { factor: 1000, unit: "mm" } : { factor: 100, unit: "cm" };
     this.unitLabel.textContent = this.written.unit;
   }
 
   fillLegend() {
     if (this.options.unit !== "m") this.unitLabel.textContent = this.options.unit ?? "";
-    fill(this.legend, this.traces.map((trace, i) => this.legendEntry(trace, i + 1)));
+    fill(
+      this.legend,
+      this.traces.map((trace, i) => this.legendEntry(trace, i + 1)),
+    );
     this.writeValues();
   }
 
@@ -289,7 +331,13 @@ export class Plot extends Emitter {
     if (trace.dash) line.style.strokeDasharray = trace.dash.join(" ");
     const swatch = svg("svg", { class: "plot-swatch", viewBox: "0 0 18 8", "aria-hidden": "true" }, line);
     const value = h("output", { class: "plot-value" });
-    const button = h("button", { type: "button", class: "plot-entry", "aria-pressed": String(!trace.hidden) }, swatch, trace.label, value);
+    const button = h(
+      "button",
+      { type: "button", class: "plot-entry", "aria-pressed": String(!trace.hidden) },
+      swatch,
+      trace.label,
+      value,
+    );
     button.addEventListener("click", () => {
       const shown = !this.u.series[index]?.show;
       this.u.setSeries(index, { show: shown });
@@ -345,7 +393,10 @@ const AXIS_FONT = "11px Inter, system-ui, sans-serif";
 /** To one digit each, where the ticks of a logarithmic axis begin and end. @param {[number, number]} range @returns {[number, number]} */
 function roundedOutwards([low, high]) {
   const power = (/** @type {number} */ value) => 10 ** Math.floor(Math.log10(value));
-  const [least, most] = [Math.floor(low / power(low) + 1e-9) * power(low), Math.ceil(high / power(high) - 1e-9) * power(high)];
+  const [least, most] = [
+    Math.floor(low / power(low) + 1e-9) * power(low),
+    Math.ceil(high / power(high) - 1e-9) * power(high),
+  ];
   return [Number(least.toPrecision(1)), Number(most.toPrecision(1))];
 }
 

@@ -30,7 +30,9 @@ const EDGE_RADIUS = { least: 1, most: 2.6, perScale: 0.7 };
  */
 export function overlayShapes(review, shown) {
   return Object.entries(review.targets).flatMap(([target, overlay]) => [
-    ...(shown.has("bands") ? lineShapes(overlay.bands_raw ?? {}, `${target}/band`, "polygon", "empty dashed thin") : []),
+    ...(shown.has("bands")
+      ? lineShapes(overlay.bands_raw ?? {}, `${target}/band`, "polygon", "empty dashed thin")
+      : []),
     ...(shown.has("lines") ? lineShapes(overlay.lines_raw ?? {}, `${target}/line`, "polyline", "") : []),
     ...(shown.has("points") ? pointShapes(overlay, target) : []),
   ]);
@@ -57,7 +59,17 @@ function lineShapes(lines, prefix, kind, extra) {
 function pointShapes(overlay, target) {
   return /** @type {const} */ (["p1", "p2"]).flatMap((name) => {
     const point = overlay[`${name}_raw`];
-    return point ? [{ id: `${target}/${name}`, kind: /** @type {const} */ ("mark"), points: [point], class: "corner-point", label: name.toUpperCase() }] : [];
+    return point
+      ? [
+          {
+            id: `${target}/${name}`,
+            kind: /** @type {const} */ ("mark"),
+            points: [point],
+            class: "corner-point",
+            label: name.toUpperCase(),
+          },
+        ]
+      : [];
   });
 }
 
@@ -71,7 +83,12 @@ export class PointPainter {
   /** @param {import("./pane.js").Pane} pane */
   constructor(pane) {
     const colour = (/** @type {string} */ name) => colourOf(pane.element, name);
-    this.colours = { used: colour("--ground-used"), rejected: colour("--ground-rejected"), edge: colour("--mark-selected"), halo: colour("--halo") };
+    this.colours = {
+      used: colour("--ground-used"),
+      rejected: colour("--ground-rejected"),
+      edge: colour("--mark-selected"),
+      halo: colour("--halo"),
+    };
     pane.addPainter((context, view) => this.#paint(context, view));
   }
 
@@ -84,7 +101,8 @@ export class PointPainter {
     if (this.shown.has("rejected")) this.#stroke(context, crosses(ground.rejected, view, GROUND_RADIUS), rejected);
     if (!this.shown.has("edges")) return;
     for (const overlay of Object.values(targets)) {
-      for (const points of Object.values(overlay.edges_raw ?? {})) fillDots(context, points, view, { colour: edge, halo: this.colours.halo });
+      for (const points of Object.values(overlay.edges_raw ?? {}))
+        fillDots(context, points, view, { colour: edge, halo: this.colours.halo });
       this.#stroke(context, circles(overlay.points_raw?.used ?? [], view, GROUND_RADIUS), edge);
       this.#stroke(context, crosses(overlay.points_raw?.rejected ?? [], view, GROUND_RADIUS), rejected);
     }

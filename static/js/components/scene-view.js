@@ -18,9 +18,24 @@ export class SceneView {
     this.host = host;
     this.projectId = projectId;
     this.amount = h("output", { class: "number", for: "exaggeration" }, "1×");
-    this.slider = h("input", { type: "range", id: "exaggeration", min: 0, max: 2, step: 0.05, value: 0, "aria-label": "Exaggeration of the roof's motion", oninput: () => this.#exaggerate() });
+    this.slider = h("input", {
+      type: "range",
+      id: "exaggeration",
+      min: 0,
+      max: 2,
+      step: 0.05,
+      value: 0,
+      "aria-label": "Exaggeration of the roof's motion",
+      oninput: () => this.#exaggerate(),
+    });
     this.message = h("div", { class: "pane-note", hidden: true, role: "status" });
-    this.bar = h("div", { class: "scene-bar" }, h("label", { for: "exaggeration" }, "Motion"), this.slider, this.amount);
+    this.bar = h(
+      "div",
+      { class: "scene-bar" },
+      h("label", { for: "exaggeration" }, "Motion"),
+      this.slider,
+      this.amount,
+    );
     host.append(this.message, this.bar);
   }
 
@@ -29,7 +44,13 @@ export class SceneView {
     this.#active = active;
     if (!active) return;
     if (this.host.querySelector("iframe") === null) {
-      this.host.prepend(h("iframe", { class: "scene-frame", title: "3-D scene: cloud, camera and roof lines", src: "/viser/?hideViserLogo" }));
+      this.host.prepend(
+        h("iframe", {
+          class: "scene-frame",
+          title: "3-D scene: cloud, camera and roof lines",
+          src: "/viser/?hideViserLogo",
+        }),
+      );
     }
     this.#wish.points ||= pointsShown();
     this.show(frame);

@@ -22,15 +22,30 @@ export function segmented({ label, choices, value, onChange }) {
   };
   const show = () => {
     const hadFocus = element.contains(document.activeElement);
-    fill(element, offered.map((choice) => {
-      const on = choice.value === chosen;
-      const attributes = { type: "button", role: "radio", "aria-checked": String(on), tabindex: on ? 0 : -1, title: choice.hint, "data-value": choice.value };
-      return h("button", { ...attributes, onclick: () => choose(choice.value) }, choice.name);
-    }));
+    fill(
+      element,
+      offered.map((choice) => {
+        const on = choice.value === chosen;
+        const attributes = {
+          type: "button",
+          role: "radio",
+          "aria-checked": String(on),
+          tabindex: on ? 0 : -1,
+          title: choice.hint,
+          "data-value": choice.value,
+        };
+        return h("button", { ...attributes, onclick: () => choose(choice.value) }, choice.name);
+      }),
+    );
     if (hadFocus) /** @type {HTMLElement | null} */ (element.querySelector("[aria-checked=true]"))?.focus();
   };
   element.addEventListener("keydown", (event) => {
-    const direction = event.key === "ArrowRight" || event.key === "ArrowDown" ? 1 : event.key === "ArrowLeft" || event.key === "ArrowUp" ? -1 : 0;
+    const direction =
+      event.key === "ArrowRight" || event.key === "ArrowDown"
+        ? 1
+        : event.key === "ArrowLeft" || event.key === "ArrowUp"
+          ? -1
+          : 0;
     if (direction === 0) return;
     event.preventDefault();
     const at = offered.findIndex((choice) => choice.value === chosen);

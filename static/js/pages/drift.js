@@ -31,7 +31,10 @@ const CORNER_STEP_HZ = 0.005;
 
 const page = await openPage("drift");
 const { store } = page;
-let results = await whenMeasured(page, "Track the video first; the drift left in its history can then be looked at here.");
+let results = await whenMeasured(
+  page,
+  "Track the video first; the drift left in its history can then be looked at here.",
+);
 
 let axis = viewText("axis") === "y" ? "y" : "x";
 let point = viewText("point") === "p2" ? "p2" : "p1";
@@ -47,15 +50,65 @@ let sweep = null;
 // the page
 const mainArea = h("div", { class: "drift-main" });
 const lowerArea = h("div", { class: "drift-lower" });
-const axisChoice = segmented({ label: "Axis", choices: AXES.map(({ value, name }) => ({ value, name })), value: axis, onChange: chooseAxis });
-const pointChoice = segmented({ label: "Point", choices: [{ value: "p1", name: "P1" }, { value: "p2", name: "P2" }], value: point, onChange: choosePoint });
-const targetChoice = segmented({ label: "Target", choices: results.targets.map((name) => ({ value: name, name })), value: target, onChange: chooseTarget });
+const axisChoice = segmented({
+  label: "Axis",
+  choices: AXES.map(({ value, name }) => ({ value, name })),
+  value: axis,
+  onChange: chooseAxis,
+});
+const pointChoice = segmented({
+  label: "Point",
+  choices: [
+    { value: "p1", name: "P1" },
+    { value: "p2", name: "P2" },
+  ],
+  value: point,
+  onChange: choosePoint,
+});
+const targetChoice = segmented({
+  label: "Target",
+  choices: results.targets.map((name) => ({ value: name, name })),
+  value: target,
+  onChange: chooseTarget,
+});
 targetChoice.element.hidden = results.targets.length < 2;
 const filterSwitch = h("input", { type: "checkbox", onchange: () => chooseFilter(filterSwitch.checked) });
-const slider = h("input", { type: "range", id: "corner", min: LOWEST_HZ, max: HIGHEST_HZ, step: CORNER_STEP_HZ, oninput: () => moveCorner(Number(slider.value)), onchange: () => saveCorner() });
-const cornerField = numberField({ label: "Corner frequency", unit: "Hz", value: corner_hz, decimals: 3, step: 0.005, min: 0.001, max: 5, bare: true, onChange: (value) => typeCorner(value) });
-const orderField = numberField({ label: "Order", unit: "", value: store.project.drift.order, decimals: 0, step: 2, min: 1, max: 20, bare: true, onChange: (value) => saveOrder(value ?? 10) });
-const kneeButton = h("button", { type: "button", class: "button small", onclick: () => typeCorner(sweep?.knee_hz ?? null) });
+const slider = h("input", {
+  type: "range",
+  id: "corner",
+  min: LOWEST_HZ,
+  max: HIGHEST_HZ,
+  step: CORNER_STEP_HZ,
+  oninput: () => moveCorner(Number(slider.value)),
+  onchange: () => saveCorner(),
+});
+const cornerField = numberField({
+  label: "Corner frequency",
+  unit: "Hz",
+  value: corner_hz,
+  decimals: 3,
+  step: 0.005,
+  min: 0.001,
+  max: 5,
+  bare: true,
+  onChange: (value) => typeCorner(value),
+});
+const orderField = numberField({
+  label: "Order",
+  unit: "",
+  value: store.project.drift.order,
+  decimals: 0,
+  step: 2,
+  min: 1,
+  max: 20,
+  bare: true,
+  onChange: (value) => saveOrder(value ?? 10),
+});
+const kneeButton = h("button", {
+  type: "button",
+  class: "button small",
+  onclick: () => typeCorner(sweep?.knee_hz ?? null),
+});
 const kneeWords = h("p", { class: "small soft" });
 const figures = h("div", { class: "figures" });
 const warnings = h("div", { class: "warnings", role: "status", "aria-live": "polite" });
@@ -64,27 +117,72 @@ const solving = h("span", { class: "badge accent", role: "status", hidden: true 
 fill(find("#main"), stageElement(), sideElement());
 
 const history = new Plot(mainArea, { title: "Displacement", unit: "m", drag: "select" });
-const sweepPlot = new Plot(lowerArea, { title: "RMS before the event", unit: "m", xUnit: "Hz", drag: "seek", zeroY: true, seekStep: CORNER_STEP_HZ });
-const spectrumPlot = new Plot(lowerArea, { title: "Spectrum", unit: "m", xUnit: "Hz", drag: "view", logX: true, logY: true });
+const sweepPlot = new Plot(lowerArea, {
+  title: "RMS before the event",
+  unit: "m",
+  xUnit: "Hz",
+  drag: "seek",
+  zeroY: true,
+  seekStep: CORNER_STEP_HZ,
+});
+const spectrumPlot = new Plot(lowerArea, {
+  title: "Spectrum",
+  unit: "m",
+  xUnit: "Hz",
+  drag: "view",
+  logX: true,
+  logY: true,
+});
 const fields = intervalFields(intervalBox, saveInterval);
 const refilter = latest(askFilter, showAnswer, (error) => (opened(), toastError(error)));
 const resweep = latest(askSweep, showSweep, (error) => showSweepProblem(error));
 const respectrum = latest(askSpectra, showSpectra, () => undefined);
-const solver = new Solver(page, () => results.ready && !results.stale, (busy) => (solving.hidden = !busy));
+const solver = new Solver(
+  page,
+  () => results.ready && !results.stale,
+  (busy) => (solving.hidden = !busy),
+);
 
 history.on("select", ({ from, to }) => saveInterval("pre_event", [from, to]));
 history.on("interval", ({ key, from, to, done }) => moveInterval(/** @type {IntervalName} */ (key), [from, to], done));
-sweepPlot.on("seek", ({ x }) => typeCorner(Math.min(Math.max(Math.round(x / CORNER_STEP_HZ) * CORNER_STEP_HZ, LOWEST_HZ), HIGHEST_HZ)));
+sweepPlot.on("seek", ({ x }) =>
+  typeCorner(Math.min(Math.max(Math.round(x / CORNER_STEP_HZ) * CORNER_STEP_HZ, LOWEST_HZ), HIGHEST_HZ)),
+);
 store.on("change", onProject);
 page.events.on("results", () => void reload().catch(toastError));
 page.keys([
-  { keys: "ArrowLeft / [", group: "Drift", label: "Lower the corner frequency", run: () => typeCorner(corner_hz - CORNER_STEP_HZ) },
-  { keys: "ArrowRight / ]", group: "Drift", label: "Raise the corner frequency", run: () => typeCorner(corner_hz + CORNER_STEP_HZ) },
-  { keys: "K", group: "Drift", label: "Take the knee as corner frequency", run: () => typeCorner(sweep?.knee_hz ?? null), when: () => sweep?.knee_hz != null },
-  { keys: "F", group: "Drift", label: "Filter on or off", run: () => chooseFilter(store.project.drift.filter === "none") },
+  {
+    keys: "ArrowLeft / [",
+    group: "Drift",
+    label: "Lower the corner frequency",
+    run: () => typeCorner(corner_hz - CORNER_STEP_HZ),
+  },
+  {
+    keys: "ArrowRight / ]",
+    group: "Drift",
+    label: "Raise the corner frequency",
+    run: () => typeCorner(corner_hz + CORNER_STEP_HZ),
+  },
+  {
+    keys: "K",
+    group: "Drift",
+    label: "Take the knee as corner frequency",
+    run: () => typeCorner(sweep?.knee_hz ?? null),
+    when: () => sweep?.knee_hz != null,
+  },
+  {
+    keys: "F",
+    group: "Drift",
+    label: "Filter on or off",
+    run: () => chooseFilter(store.project.drift.filter === "none"),
+  },
   { keys: "A", group: "Drift", label: "East or north", run: () => chooseAxis(axis === "x" ? "y" : "x") },
   { keys: "P", group: "Drift", label: "P1 or P2", run: () => choosePoint(point === "p1" ? "p2" : "p1") },
-  { keys: "Drag", group: "Plots", label: "On the displacement: the pre-event interval; on the RMS: the corner frequency" },
+  {
+    keys: "Drag",
+    group: "Plots",
+    label: "On the displacement: the pre-event interval; on the RMS: the corner frequency",
+  },
   { keys: "Wheel", group: "Plots", label: "Zoom; Alt+drag pans, a double click shows all" },
 ]);
 onProject();
@@ -92,30 +190,74 @@ const opened = busyOver(mainArea, "Solving…");
 await reload().catch(toastError);
 
 function stageElement() {
-  return h("div", { class: "stage" },
-    h("div", { class: "stage-bar" }, h("h1", {}, "Drift"), targetChoice.element, pointChoice.element, h("span", { class: "spring" }), solving, axisChoice.element),
-    h("div", { class: "stage-body drift-stage" }, mainArea, lowerArea));
+  return h(
+    "div",
+    { class: "stage" },
+    h(
+      "div",
+      { class: "stage-bar" },
+      h("h1", {}, "Drift"),
+      targetChoice.element,
+      pointChoice.element,
+      h("span", { class: "spring" }),
+      solving,
+      axisChoice.element,
+    ),
+    h("div", { class: "stage-body drift-stage" }, mainArea, lowerArea),
+  );
 }
 
 function sideElement() {
-  return h("aside", { class: "side", "aria-label": "Filter and intervals" },
-    h("section", { class: "section" },
+  return h(
+    "aside",
+    { class: "side", "aria-label": "Filter and intervals" },
+    h(
+      "section",
+      { class: "section" },
       h("header", {}, h("h2", {}, "High-pass filter"), h("label", { class: "switch" }, filterSwitch, "Apply")),
-      h("p", { class: "small soft" }, "Written to the result only when applied; the preview on the left is always drawn."),
-      h("div", { class: "corner-row" }, h("label", { class: "label", for: "corner" }, "Corner frequency"), cornerField.element),
+      h(
+        "p",
+        { class: "small soft" },
+        "Written to the result only when applied; the preview on the left is always drawn.",
+      ),
+      h(
+        "div",
+        { class: "corner-row" },
+        h("label", { class: "label", for: "corner" }, "Corner frequency"),
+        cornerField.element,
+      ),
       slider,
-      h("div", { class: "toolbar" }, kneeButton, h("span", { class: "spring" }), h("span", { class: "label" }, "Order"), h("div", { class: "order-field" }, orderField.element)),
-      kneeWords, figures, warnings),
-    h("section", { class: "section" },
+      h(
+        "div",
+        { class: "toolbar" },
+        kneeButton,
+        h("span", { class: "spring" }),
+        h("span", { class: "label" }, "Order"),
+        h("div", { class: "order-field" }, orderField.element),
+      ),
+      kneeWords,
+      figures,
+      warnings,
+    ),
+    h(
+      "section",
+      { class: "section" },
       h("header", {}, h("h2", {}, "Intervals")),
-      h("p", { class: "small soft" }, "Drag across the plot where the building stands still before the event; pull the handles, or type."),
-      intervalBox));
+      h(
+        "p",
+        { class: "small soft" },
+        "Drag across the plot where the building stands still before the event; pull the handles, or type.",
+      ),
+      intervalBox,
+    ),
+  );
 }
 
 /** Everything that depends on results. */
 async function reload() {
   results = await fetchResults(page.id);
-  if (results.methods.includes("geometric")) geometric = await fetchHistory(page.id, target, "geometric").catch(() => null);
+  if (results.methods.includes("geometric"))
+    geometric = await fetchHistory(page.id, target, "geometric").catch(() => null);
   ask();
 }
 
@@ -131,7 +273,13 @@ function ask() {
 /** @param {number} corner @returns {Promise<DriftAnswer>} */
 function askFilter(corner) {
   const { drift, intervals_s } = store.project;
-  return post(projectPath(page.id, "drift"), { target, point, corner_hz: corner, order: drift.order, interval: intervals_s.pre_event });
+  return post(projectPath(page.id, "drift"), {
+    target,
+    point,
+    corner_hz: corner,
+    order: drift.order,
+    interval: intervals_s.pre_event,
+  });
 }
 
 /** @param {[number, number]} rest @returns {Promise<Sweep>} */
@@ -142,8 +290,12 @@ function askSweep([start, end]) {
 /** @param {[number, number]} rest @returns {Promise<{before: Spectrum, during: Spectrum | null}>} */
 async function askSpectra([start, end]) {
   const { event } = store.project.intervals_s;
-  const spectrum = (/** @type {number} */ from, /** @type {number} */ to) => get(projectPath(page.id, "drift/spectrum", { target, point, start: from, end: to }));
-  const [before, during] = await Promise.all([spectrum(start, end), event ? spectrum(...event).catch(() => null) : null]);
+  const spectrum = (/** @type {number} */ from, /** @type {number} */ to) =>
+    get(projectPath(page.id, "drift/spectrum", { target, point, start: from, end: to }));
+  const [before, during] = await Promise.all([
+    spectrum(start, end),
+    event ? spectrum(...event).catch(() => null) : null,
+  ]);
   return { before, during };
 }
 
@@ -153,7 +305,11 @@ function showAnswer(newest) {
   opened();
   drawHistory();
   showFigures();
-  fill(warnings, newest.warnings.map((words) => note("warn", words)), newest.warnings.length ? null : note("info", "No warning for this corner frequency."));
+  fill(
+    warnings,
+    newest.warnings.map((words) => note("warn", words)),
+    newest.warnings.length ? null : note("info", "No warning for this corner frequency."),
+  );
 }
 
 function drawHistory() {
@@ -184,7 +340,10 @@ function showSweep(newest) {
   sweepPlot.setTraces(traces, [newest.corners_hz, newest.rms_m.dx, newest.rms_m.dy]);
   kneeButton.hidden = newest.knee_hz === null;
   if (newest.knee_hz !== null) kneeButton.textContent = `Take the knee, ${fixed(newest.knee_hz, 3)} Hz`;
-  kneeWords.textContent = newest.knee_hz === null ? "The curve has no knee: no corner frequency stands out." : `Above ${fixed(newest.knee_hz, 3)} Hz a higher corner hardly makes the pre-event quieter.`;
+  kneeWords.textContent =
+    newest.knee_hz === null
+      ? "The curve has no knee: no corner frequency stands out."
+      : `Above ${fixed(newest.knee_hz, 3)} Hz a higher corner hardly makes the pre-event quieter.`;
   kneeWords.hidden = false;
   markCorner();
 }
@@ -198,14 +357,19 @@ function showSweepProblem(error) {
 }
 
 function showNoInterval() {
-  showSweepProblem(new Error("Give the pre-event interval first: drag across the plot where the building stands still."));
+  showSweepProblem(
+    new Error("Give the pre-event interval first: drag across the plot where the building stands still."),
+  );
 }
 
 /** @param {{before: Spectrum, during: Spectrum | null}} spectra */
 function showSpectra({ before, during }) {
   const key = axis === "x" ? "dx_m" : "dy_m";
   spectrumPlot.setTraces(
-    [{ label: "Pre-event", colour: "--series-3" }, { label: "Event", colour: "--series-5", dash: [5, 3] }],
+    [
+      { label: "Pre-event", colour: "--series-3" },
+      { label: "Event", colour: "--series-5", dash: [5, 3] },
+    ],
     /** @type {any} */ (onOneAxis([before, during], key)),
   );
   markCorner();
@@ -217,29 +381,44 @@ function showSpectra({ before, during }) {
  * @param {"dx_m" | "dy_m"} key
  */
 function onOneAxis(spectra, key) {
-  const points = spectra.flatMap((spectrum, which) => (spectrum?.frequency_hz ?? []).map((hz, i) => ({ hz, which, value: spectrum?.[key][i] ?? 0 })));
+  const points = spectra.flatMap((spectrum, which) =>
+    (spectrum?.frequency_hz ?? []).map((hz, i) => ({ hz, which, value: spectrum?.[key][i] ?? 0 })),
+  );
   const useful = points.filter(({ hz, value }) => hz > 0 && value > 0).sort((a, b) => a.hz - b.hz);
   // undefined is bridged, null would be a gap
-  return [useful.map(({ hz }) => hz), ...spectra.map((_, which) => useful.map((entry) => (entry.which === which ? entry.value : undefined)))];
+  return [
+    useful.map(({ hz }) => hz),
+    ...spectra.map((_, which) => useful.map((entry) => (entry.which === which ? entry.value : undefined))),
+  ];
 }
 
 function markCorner() {
   const atKnee = Math.abs(corner_hz - (sweep?.knee_hz ?? 0)) < CORNER_STEP_HZ / 2;
-  const corner = { at: corner_hz, label: `${atKnee ? "corner at the knee," : "corner"} ${fixed(corner_hz, 3)} Hz`, colour: "--accent" };
-  const knee = sweep?.knee_hz && !atKnee ? [{ at: sweep.knee_hz, label: `knee ${fixed(sweep.knee_hz, 3)} Hz`, colour: "--series-4" }] : [];
+  const corner = {
+    at: corner_hz,
+    label: `${atKnee ? "corner at the knee," : "corner"} ${fixed(corner_hz, 3)} Hz`,
+    colour: "--accent",
+  };
+  const knee =
+    sweep?.knee_hz && !atKnee
+      ? [{ at: sweep.knee_hz, label: `knee ${fixed(sweep.knee_hz, 3)} Hz`, colour: "--series-4" }]
+      : [];
   sweepPlot.setVerticals([corner, ...knee]);
   sweepPlot.head = corner_hz;
   spectrumPlot.setVerticals([corner]);
 }
 
 function showFigures() {
-  const figure = (/** @type {number | null | undefined} */ value_m, /** @type {string} */ name) => h("div", {}, h("span", { class: "value" }, millimetres(value_m, 1)), h("span", { class: "name" }, name));
+  const figure = (/** @type {number | null | undefined} */ value_m, /** @type {string} */ name) =>
+    h("div", {}, h("span", { class: "value" }, millimetres(value_m, 1)), h("span", { class: "name" }, name));
   const key = axis === "x" ? "dx" : "dy";
   const after = answer?.filtered_pre_event_rms_m?.[key];
   const exact = results.summary?.targets?.[target]?.pre_event_rms_m?.[axis];
-  fill(figures,
+  fill(
+    figures,
     after == null ? null : figure(after, "filtered, pre-event RMS"),
-    exact == null || store.project.method !== "geometric" ? null : figure(exact, "geometric"));
+    exact == null || store.project.method !== "geometric" ? null : figure(exact, "geometric"),
+  );
 }
 
 /** Preview another corner; nothing is saved yet. @param {number} wanted_hz */
@@ -262,24 +441,49 @@ function typeCorner(wanted_hz) {
 function saveCorner() {
   const wanted = corner_hz;
   if (wanted === store.project.drift.corner_hz) return;
-  save("Corner frequency", (draft) => { draft.drift.corner_hz = wanted; }, store.project.drift.filter !== "none");
+  save(
+    "Corner frequency",
+    (draft) => {
+      draft.drift.corner_hz = wanted;
+    },
+    store.project.drift.filter !== "none",
+  );
 }
 
 /** @param {number} order */
 function saveOrder(order) {
-  save("Filter order", (draft) => { draft.drift.order = order; }, store.project.drift.filter !== "none");
+  save(
+    "Filter order",
+    (draft) => {
+      draft.drift.order = order;
+    },
+    store.project.drift.filter !== "none",
+  );
 }
 
 /** @param {boolean} on */
 function chooseFilter(on) {
-  save(on ? "Apply the filter" : "Do not filter", (draft) => { draft.drift.filter = on ? "high-pass" : "none"; }, true);
+  save(
+    on ? "Apply the filter" : "Do not filter",
+    (draft) => {
+      draft.drift.filter = on ? "high-pass" : "none";
+    },
+    true,
+  );
 }
 
 /** @param {IntervalName} name @param {[number, number] | null} interval */
 function saveInterval(name, interval) {
-  const rounded = interval && /** @type {[number, number]} */ (interval.map((value) => Math.round(value * 1000) / 1000));
+  const rounded =
+    interval && /** @type {[number, number]} */ (interval.map((value) => Math.round(value * 1000) / 1000));
   const words = INTERVALS.find((entry) => entry.name === name)?.label ?? name;
-  save(`${words} interval`, (draft) => { draft.intervals_s[name] = rounded; }, true);
+  save(
+    `${words} interval`,
+    (draft) => {
+      draft.intervals_s[name] = rounded;
+    },
+    true,
+  );
 }
 
 /** An end is being pulled: draw it, and save when it is let go. @param {IntervalName} name @param {[number, number]} interval @param {boolean} done */
@@ -289,7 +493,9 @@ function moveInterval(name, interval, done) {
 
 /** @param {string} label @param {import("../lib/store.js").Change} change @param {boolean} changesResult */
 function save(label, change, changesResult) {
-  const saved = changesResult ? solver.edit(label, change, { merge: true }) : store.edit(label, change, { merge: true });
+  const saved = changesResult
+    ? solver.edit(label, change, { merge: true })
+    : store.edit(label, change, { merge: true });
   void saved.then(ask);
 }
 
@@ -301,10 +507,14 @@ function onProject() {
   if (document.activeElement !== slider && drift.corner_hz !== corner_hz) moveCorner(drift.corner_hz);
   cornerField.set(corner_hz);
   slider.value = String(corner_hz);
-  history.setIntervals(INTERVALS.flatMap(({ name, label, colour }) => {
-    const interval = intervals_s[name];
-    return interval ? [{ key: name, label: label.toLowerCase(), from: interval[0], to: interval[1], colour, editable: true }] : [];
-  }));
+  history.setIntervals(
+    INTERVALS.flatMap(({ name, label, colour }) => {
+      const interval = intervals_s[name];
+      return interval
+        ? [{ key: name, label: label.toLowerCase(), from: interval[0], to: interval[1], colour, editable: true }]
+        : [];
+    }),
+  );
 }
 
 /** @param {string} wanted */

@@ -38,7 +38,10 @@ const FILE_WORDS = [
 ];
 
 const page = await openPage("export");
-let results = await whenMeasured(page, "Track the video first; the result is then compared with GPS and exported from here.");
+let results = await whenMeasured(
+  page,
+  "Track the video first; the result is then compared with GPS and exported from here.",
+);
 
 let axis = viewText("axis") === "y" ? "y" : "x";
 let target = results.targets.find((name) => name === viewText("target")) ?? results.targets[0] ?? "";
@@ -49,8 +52,18 @@ let history = null;
 let problem = "";
 
 // the page
-const axisChoice = segmented({ label: "Axis", choices: AXES.map(({ value, name }) => ({ value, name })), value: axis, onChange: chooseAxis });
-const targetChoice = segmented({ label: "Target", choices: results.targets.map((name) => ({ value: name, name })), value: target, onChange: chooseTarget });
+const axisChoice = segmented({
+  label: "Axis",
+  choices: AXES.map(({ value, name }) => ({ value, name })),
+  value: axis,
+  onChange: chooseAxis,
+});
+const targetChoice = segmented({
+  label: "Target",
+  choices: results.targets.map((name) => ({ value: name, name })),
+  value: target,
+  onChange: chooseTarget,
+});
 targetChoice.element.hidden = results.targets.length < 2;
 const overlayBox = h("div", { class: "export-overlay" });
 const errorBox = h("div", { class: "export-error" });
@@ -60,9 +73,19 @@ const fileBox = h("section", { class: "section", "aria-label": "Files" });
 const archiveBox = h("section", { class: "section", "aria-label": "Project archive" });
 fill(
   find("#main"),
-  h("div", { class: "stage" },
-    h("div", { class: "stage-bar" }, h("h1", {}, "Validate and export"), targetChoice.element, h("span", { class: "spring" }), axisChoice.element),
-    h("div", { class: "stage-body export-stage" }, overlayBox, errorBox, tableBox)),
+  h(
+    "div",
+    { class: "stage" },
+    h(
+      "div",
+      { class: "stage-bar" },
+      h("h1", {}, "Validate and export"),
+      targetChoice.element,
+      h("span", { class: "spring" }),
+      axisChoice.element,
+    ),
+    h("div", { class: "stage-body export-stage" }, overlayBox, errorBox, tableBox),
+  ),
   h("aside", { class: "side", "aria-label": "Validation and files" }, gpsBox, fileBox, archiveBox),
 );
 const overlay = new Plot(overlayBox, { title: "Displacement", unit: "m", link: "export", drag: "view" });
@@ -73,7 +96,13 @@ page.events.on("results", () => void reload().catch(toastError));
 page.events.on("job", onJob);
 page.keys([
   { keys: "A", group: "Validate", label: "East or north", run: () => chooseAxis(axis === "x" ? "y" : "x") },
-  { keys: "D", group: "Export", label: "Download the displacement history", run: () => find("a[data-main]", HTMLAnchorElement).click(), when: () => document.querySelector("a[data-main]") !== null },
+  {
+    keys: "D",
+    group: "Export",
+    label: "Download the displacement history",
+    run: () => find("a[data-main]", HTMLAnchorElement).click(),
+    when: () => document.querySelector("a[data-main]") !== null,
+  },
   { keys: "Wheel", group: "Plots", label: "Zoom in time; a drag pans, a double click shows all" },
 ]);
 showArchive();
@@ -119,14 +148,26 @@ function draw() {
   errorBox.hidden = !gps || !validation?.error;
   if (validation && gps) {
     const [time, video, reference] = joined(validation.video, gps, key);
-    overlay.setTraces([{ label: "Video", colour: "--series-1", width: 1.6 }, { label: "GPS", colour: "--series-2", dash: [5, 3], width: 1.6 }], /** @type {any} */ ([time, video, reference]));
+    overlay.setTraces(
+      [
+        { label: "Video", colour: "--series-1", width: 1.6 },
+        { label: "GPS", colour: "--series-2", dash: [5, 3], width: 1.6 },
+      ],
+      /** @type {any} */ ([time, video, reference]),
+    );
     const { error } = validation;
     if (error) errorPlot.setTraces([{ label: "Error", colour: "--series-4" }], [error.time_s, error[key]]);
     const domain = /** @type {[number, number]} */ ([time[0], time.at(-1) ?? 1]);
     overlay.setDomain(domain);
     errorPlot.setDomain(domain);
   } else if (history) {
-    overlay.setTraces([{ label: "P1", colour: "--series-1" }, { label: "P2", colour: "--series-3", dash: [6, 4] }], [history.time_s, history[`p1_${key}`], history[`p2_${key}`]]);
+    overlay.setTraces(
+      [
+        { label: "P1", colour: "--series-1" },
+        { label: "P2", colour: "--series-3", dash: [6, 4] },
+      ],
+      [history.time_s, history[`p1_${key}`], history[`p2_${key}`]],
+    );
     overlay.setStatuses(history.status);
   }
 }
@@ -139,7 +180,10 @@ function draw() {
  * @param {"dx_m" | "dy_m"} key
  */
 function joined(a, b, key) {
-  const points = [...a.time_s.map((time, i) => ({ time, a: a[key][i], b: /** @type {number | null | undefined} */ (undefined) })), ...b.time_s.map((time, i) => ({ time, a: undefined, b: b[key][i] }))];
+  const points = [
+    ...a.time_s.map((time, i) => ({ time, a: a[key][i], b: /** @type {number | null | undefined} */ (undefined) })),
+    ...b.time_s.map((time, i) => ({ time, a: undefined, b: b[key][i] })),
+  ];
   points.sort((one, other) => one.time - other.time);
   return [points.map((entry) => entry.time), points.map((entry) => entry.a), points.map((entry) => entry.b)];
 }
@@ -147,18 +191,34 @@ function joined(a, b, key) {
 function showGps() {
   const given = page.store.project.inputs.gps !== null;
   const compared = validation ?? results.summary?.targets?.[target]?.gps ?? null;
-  const figure = (/** @type {string} */ value, /** @type {string} */ name) => h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
+  const figure = (/** @type {string} */ value, /** @type {string} */ name) =>
+    h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
   fill(
     gpsBox,
     h("header", {}, h("h2", {}, "Against GPS")),
-    given ? null : note("info", "No GPS record is given, so there is nothing to compare with. Peaks and residual below come from the video alone."),
-    given ? null : h("div", { class: "toolbar" }, h("a", { class: "button small", href: stepUrl(page.id, "inputs") }, "Add a GPS record")),
+    given
+      ? null
+      : note(
+          "info",
+          "No GPS record is given, so there is nothing to compare with. Peaks and residual below come from the video alone.",
+        ),
+    given
+      ? null
+      : h(
+          "div",
+          { class: "toolbar" },
+          h("a", { class: "button small", href: stepUrl(page.id, "inputs") }, "Add a GPS record"),
+        ),
     problem ? note("warn", problem) : null,
     compared?.message ? note("warn", compared.message) : null,
-    compared && h("div", { class: "figures" },
-      figure(millimetres(compared.rms_m?.x, 1), "RMS error, east"),
-      figure(millimetres(compared.rms_m?.y, 1), "RMS error, north"),
-      figure(lagWords(compared.lag_s), "clock lag, applied")),
+    compared &&
+      h(
+        "div",
+        { class: "figures" },
+        figure(millimetres(compared.rms_m?.x, 1), "RMS error, east"),
+        figure(millimetres(compared.rms_m?.y, 1), "RMS error, north"),
+        figure(lagWords(compared.lag_s), "clock lag, applied"),
+      ),
     compared && h("p", { class: "small soft" }, lagSentence(compared)),
   );
 }
@@ -177,7 +237,16 @@ function lagSentence({ lag_s, lag_sigma_s }) {
 
 function showTable() {
   const rows = validation?.table ?? rowsOf(results.summary?.targets?.[target]?.gps);
-  fill(tableBox, h("header", {}, h("h2", {}, rows.length ? "Peaks and residual, video and GPS" : "Peaks and residual"), h("span", { class: "badge" }, target)), rows.length ? comparisonTable(rows) : summaryTable());
+  fill(
+    tableBox,
+    h(
+      "header",
+      {},
+      h("h2", {}, rows.length ? "Peaks and residual, video and GPS" : "Peaks and residual"),
+      h("span", { class: "badge" }, target),
+    ),
+    rows.length ? comparisonTable(rows) : summaryTable(),
+  );
 }
 
 /**
@@ -187,10 +256,23 @@ function showTable() {
  */
 function rowsOf(gps) {
   if (!gps) return [];
-  return QUANTITIES.flatMap(({ name }) => AXES.flatMap(({ value }) => {
-    const row = gps[`${name}_m`]?.[value];
-    return row ? [{ quantity: name, axis: value, video_m: row.video, gps_m: row.gps, error_m: row.error, error_percent: row.error_percent }] : [];
-  }));
+  return QUANTITIES.flatMap(({ name }) =>
+    AXES.flatMap(({ value }) => {
+      const row = gps[`${name}_m`]?.[value];
+      return row
+        ? [
+            {
+              quantity: name,
+              axis: value,
+              video_m: row.video,
+              gps_m: row.gps,
+              error_m: row.error,
+              error_percent: row.error_percent,
+            },
+          ]
+        : [];
+    }),
+  );
 }
 
 /** The paper's Table 2: a row per axis. @param {TableRow[]} rows */
@@ -198,33 +280,108 @@ function comparisonTable(rows) {
   const cells = (/** @type {Quantity} */ quantity, /** @type {"x" | "y"} */ of) => {
     const row = rows.find((entry) => entry.quantity === quantity && entry.axis === of);
     if (row === undefined) return [h("td", { class: "number group faint", colspan: 3 }, "–")];
-    const percent = row.error_percent === null ? null : h("span", { class: "faint" }, ` (${fixed(row.error_percent, row.error_percent < 100 ? 1 : 0)} %)`);
-    return [h("td", { class: "number group" }, fixed(row.video_m * 100, 2)), h("td", { class: "number" }, fixed(row.gps_m * 100, 2)), h("td", { class: "number strong" }, fixed(row.error_m * 100, 2), percent)];
+    const percent =
+      row.error_percent === null
+        ? null
+        : h("span", { class: "faint" }, ` (${fixed(row.error_percent, row.error_percent < 100 ? 1 : 0)} %)`);
+    return [
+      h("td", { class: "number group" }, fixed(row.video_m * 100, 2)),
+      h("td", { class: "number" }, fixed(row.gps_m * 100, 2)),
+      h("td", { class: "number strong" }, fixed(row.error_m * 100, 2), percent),
+    ];
   };
-  return h("table", { class: "table comparison" },
+  return h(
+    "table",
+    { class: "table comparison" },
     h("caption", { class: "visually-hidden" }, "Peak and residual displacement from video and GPS, centimetres"),
-    h("thead", {},
-      h("tr", {}, h("th", { rowspan: 2, scope: "col" }, "cm"), QUANTITIES.map(({ title }) => h("th", { colspan: 3, scope: "colgroup", class: "group centre" }, title))),
-      h("tr", {}, QUANTITIES.flatMap(() => ["Video", "GPS", "Error"].map((title, i) => h("th", { scope: "col", class: `number ${i === 0 ? "group" : ""}` }, title))))),
-    h("tbody", {}, AXES.map((entry) => h("tr", {}, h("th", { scope: "row" }, entry.name), QUANTITIES.flatMap(({ name }) => cells(name, entry.value))))));
+    h(
+      "thead",
+      {},
+      h(
+        "tr",
+        {},
+        h("th", { rowspan: 2, scope: "col" }, "cm"),
+        QUANTITIES.map(({ title }) => h("th", { colspan: 3, scope: "colgroup", class: "group centre" }, title)),
+      ),
+      h(
+        "tr",
+        {},
+        QUANTITIES.flatMap(() =>
+          ["Video", "GPS", "Error"].map((title, i) =>
+            h("th", { scope: "col", class: `number ${i === 0 ? "group" : ""}` }, title),
+          ),
+        ),
+      ),
+    ),
+    h(
+      "tbody",
+      {},
+      AXES.map((entry) =>
+        h(
+          "tr",
+          {},
+          h("th", { scope: "row" }, entry.name),
+          QUANTITIES.flatMap(({ name }) => cells(name, entry.value)),
+        ),
+      ),
+    ),
+  );
 }
 
 /** Without GPS: what the video alone tells, P1 and P2. */
 function summaryTable() {
   const summary = results.summary?.targets?.[target];
   if (!summary) return h("p", { class: "soft" }, "The summary has no rows for this target.");
-  const peak = (/** @type {any} */ entry) => h("td", { class: "number" }, centimetres(entry?.value, 2), h("span", { class: "faint" }, entry ? ` at ${fixed(entry.time_s, 2)} s` : ""));
-  const rows = [["P1", summary], ["P2", summary.p2]].filter(([, of]) => of).flatMap(([name, of]) => AXES.map((entry) =>
-    h("tr", {}, h("th", { scope: "row" }, `${name}, ${entry.name}`), peak(of.peak_positive_m?.[entry.value]), peak(of.peak_negative_m?.[entry.value]), h("td", { class: "number" }, centimetres(of.residual_m?.[entry.value], 2)), h("td", { class: "number" }, millimetres(of.pre_event_rms_m?.[entry.value], 2)))));
-  const head = ["", "Peak, positive", "Peak, negative", "Residual", "Pre-event RMS"].map((title, i) => h("th", { scope: "col", class: i ? "number" : "" }, title));
+  const peak = (/** @type {any} */ entry) =>
+    h(
+      "td",
+      { class: "number" },
+      centimetres(entry?.value, 2),
+      h("span", { class: "faint" }, entry ? ` at ${fixed(entry.time_s, 2)} s` : ""),
+    );
+  const rows = [
+    ["P1", summary],
+    ["P2", summary.p2],
+  ]
+    .filter(([, of]) => of)
+    .flatMap(([name, of]) =>
+      AXES.map((entry) =>
+        h(
+          "tr",
+          {},
+          h("th", { scope: "row" }, `${name}, ${entry.name}`),
+          peak(of.peak_positive_m?.[entry.value]),
+          peak(of.peak_negative_m?.[entry.value]),
+          h("td", { class: "number" }, centimetres(of.residual_m?.[entry.value], 2)),
+          h("td", { class: "number" }, millimetres(of.pre_event_rms_m?.[entry.value], 2)),
+        ),
+      ),
+    );
+  const head = ["", "Peak, positive", "Peak, negative", "Residual", "Pre-event RMS"].map((title, i) =>
+    h("th", { scope: "col", class: i ? "number" : "" }, title),
+  );
   return h("table", { class: "table comparison" }, h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows));
 }
 
 function showFiles() {
   const files = [...results.files].sort((a, b) => rank(a) - rank(b));
   const report = files.some(({ name }) => name === "report.html");
-  const make = h("button", { type: "button", class: "button small", onclick: makeReport }, icon("refresh", "small"), report ? "Remake" : "Make the report");
-  fill(fileBox, h("header", {}, h("h2", {}, "Files"), make), results.stale ? note("warn", "The project has changed since these files were made; update the results on the Track page.") : null, reportJob.element, h("ul", { class: "file-rows" }, files.filter((file) => !isFigure(file)).map(fileRow)), figureRows(files.filter(isFigure)));
+  const make = h(
+    "button",
+    { type: "button", class: "button small", onclick: makeReport },
+    icon("refresh", "small"),
+    report ? "Remake" : "Make the report",
+  );
+  fill(
+    fileBox,
+    h("header", {}, h("h2", {}, "Files"), make),
+    results.stale
+      ? note("warn", "The project has changed since these files were made; update the results on the Track page.")
+      : null,
+    reportJob.element,
+    h("ul", { class: "file-rows" }, files.filter((file) => !isFigure(file)).map(fileRow)),
+    figureRows(files.filter(isFigure)),
+  );
 }
 
 /** @param {ResultFile} file */
@@ -235,7 +392,12 @@ function isFigure({ name }) {
 /** @param {ResultFile[]} figures */
 function figureRows(figures) {
   if (figures.length === 0) return null;
-  return h("details", { class: "more-files" }, h("summary", {}, plural(figures.length, "figure")), h("ul", { class: "file-rows" }, figures.map(fileRow)));
+  return h(
+    "details",
+    { class: "more-files" },
+    h("summary", {}, plural(figures.length, "figure")),
+    h("ul", { class: "file-rows" }, figures.map(fileRow)),
+  );
 }
 
 /** @param {ResultFile} file */
@@ -250,13 +412,45 @@ function fileRow(file) {
   const url = `/api/${projectPath(page.id, `files/${file.name.split("/").map(encodeURIComponent).join("/")}`)}`;
   const main = file.name === `${target}.csv`;
   const words = FILE_WORDS.find(({ test }) => test.test(file.name))?.words ?? "";
-  const open = file.name.endsWith(".html") ? h("a", { class: "button quiet small icon-only", href: url, target: "_blank", rel: "noopener", "aria-label": `Open ${file.name}`, title: "Open" }, icon("expand", "small")) : null;
-  return h("li", {},
+  const open = file.name.endsWith(".html")
+    ? h(
+        "a",
+        {
+          class: "button quiet small icon-only",
+          href: url,
+          target: "_blank",
+          rel: "noopener",
+          "aria-label": `Open ${file.name}`,
+          title: "Open",
+        },
+        icon("expand", "small"),
+      )
+    : null;
+  return h(
+    "li",
+    {},
     icon("file"),
-    h("span", { class: "file-words" }, h("span", { class: "file-name", title: file.name }, file.name.replace(/^figures\//, "")), words ? h("span", { class: "small faint" }, words) : null),
+    h(
+      "span",
+      { class: "file-words" },
+      h("span", { class: "file-name", title: file.name }, file.name.replace(/^figures\//, "")),
+      words ? h("span", { class: "small faint" }, words) : null,
+    ),
     h("span", { class: "number small faint" }, size(file.size)),
     open,
-    h("a", { class: `button small icon-only ${main ? "primary" : "quiet"}`, href: url, download: file.name, "aria-label": `Download ${file.name}`, title: `Download ${file.name}`, "data-main": main }, icon("download", "small")));
+    h(
+      "a",
+      {
+        class: `button small icon-only ${main ? "primary" : "quiet"}`,
+        href: url,
+        download: file.name,
+        "aria-label": `Download ${file.name}`,
+        title: `Download ${file.name}`,
+        "data-main": main,
+      },
+      icon("download", "small"),
+    ),
+  );
 }
 
 function showArchive() {
@@ -268,7 +462,11 @@ function showArchive() {
   fill(
     archiveBox,
     h("header", {}, h("h2", {}, "Whole project")),
-    h("p", { class: "small soft" }, "One archive with every decision and result. Restore it on any computer from the list of projects."),
+    h(
+      "p",
+      { class: "small soft" },
+      "One archive with every decision and result. Restore it on any computer from the list of projects.",
+    ),
     h("label", { class: "check" }, inputs, "With video, cloud, lens and GPS"),
     h("div", { class: "toolbar" }, link),
   );

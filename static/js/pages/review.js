@@ -27,13 +27,20 @@ import { toast, toastError } from "../components/toast.js";
 /** @typedef {"frame" | "both" | "scene"} Stage */
 
 /** @type {{value: Stage, name: string}[]} */
-const STAGES = [{ value: "frame", name: "Frame" }, { value: "both", name: "Both" }, { value: "scene", name: "3-D" }];
+const STAGES = [
+  { value: "frame", name: "Frame" },
+  { value: "both", name: "Both" },
+  { value: "scene", name: "3-D" },
+];
 /** @type {Record<string, string>} */
 const STATUS_TONES = { ok: "good", weak: "warn", lost: "bad", excluded: "" };
 
 const page = await openPage("review");
 const { store } = page;
-let results = await whenMeasured(page, "Track the video first; every frame can then be looked at here, with what was measured on it.");
+let results = await whenMeasured(
+  page,
+  "Track the video first; every frame can then be looked at here, with what was measured on it.",
+);
 const { video } = await get(projectPath(page.id, "inputs"));
 
 // what is looked at
@@ -54,9 +61,23 @@ const stageBody = h("div", { class: "stage-body review-stage" }, frameBox, scene
 const transport = h("div", { class: "review-transport" });
 const plotArea = h("div", { class: "review-plots" });
 const stageChoice = segmented({ label: "View", choices: STAGES, value: stage, onChange: chooseStage });
-const targetChoice = segmented({ label: "Target", choices: results.targets.map((name) => ({ value: name, name })), value: target, onChange: chooseTarget });
-const methodChoice = segmented({ label: "Method", choices: results.methods.map((name) => ({ value: name, name: methodName(name) })), value: method, onChange: chooseMethod });
-const compareSwitch = h("input", { type: "checkbox", checked: compared, onchange: () => compare(compareSwitch.checked) });
+const targetChoice = segmented({
+  label: "Target",
+  choices: results.targets.map((name) => ({ value: name, name })),
+  value: target,
+  onChange: chooseTarget,
+});
+const methodChoice = segmented({
+  label: "Method",
+  choices: results.methods.map((name) => ({ value: name, name: methodName(name) })),
+  value: method,
+  onChange: chooseMethod,
+});
+const compareSwitch = h("input", {
+  type: "checkbox",
+  checked: compared,
+  onchange: () => compare(compareSwitch.checked),
+});
 const compareLabel = h("label", { class: "switch small" }, compareSwitch, "Compare methods");
 const solving = h("span", { class: "badge accent", role: "status", hidden: true }, "Solving again…");
 const facts = h("section", { class: "section", "aria-label": "This frame" });
@@ -68,17 +89,47 @@ methodChoice.element.hidden = compareSwitch.disabled = results.methods.length < 
 compareLabel.title = compareSwitch.disabled ? "Track with the other method too; then both can be compared." : "";
 fill(
   find("#main"),
-  h("div", { class: "stage" },
-    h("div", { class: "stage-bar" }, h("h1", {}, "Review"), stageChoice.element, targetChoice.element, h("span", { class: "spring" }), solving, compareLabel, methodChoice.element),
-    stageBody, transport, plotArea),
+  h(
+    "div",
+    { class: "stage" },
+    h(
+      "div",
+      { class: "stage-bar" },
+      h("h1", {}, "Review"),
+      stageChoice.element,
+      targetChoice.element,
+      h("span", { class: "spring" }),
+      solving,
+      compareLabel,
+      methodChoice.element,
+    ),
+    stageBody,
+    transport,
+    plotArea,
+  ),
   h("aside", { class: "side", "aria-label": "Frame and overlay" }, facts, doubtful, excluded, layerList),
 );
-const view = new FrameView(frameBox, new FrameLibrary(page.id, { size: [video.width, video.height], count: video.frames }), method);
+const view = new FrameView(
+  frameBox,
+  new FrameLibrary(page.id, { size: [video.width, video.height], count: video.frames }),
+  method,
+);
 const scene = new SceneView(sceneBox, page.id);
 const player = new Player(transport);
-const plots = AXES.map((axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "review", drag: "seek", leastSpan: 0.002 }));
-const solver = new Solver(page, () => results.ready && !results.stale, (busy) => (solving.hidden = !busy));
-const exclusions = new ExclusionEditor(excluded, { store, solver, onSelection: showSelection, onJump: (frame) => player.go(frame) });
+const plots = AXES.map(
+  (axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "review", drag: "seek", leastSpan: 0.002 }),
+);
+const solver = new Solver(
+  page,
+  () => results.ready && !results.stale,
+  (busy) => (solving.hidden = !busy),
+);
+const exclusions = new ExclusionEditor(excluded, {
+  store,
+  solver,
+  onSelection: showSelection,
+  onJump: (frame) => player.go(frame),
+});
 
 listen();
 page.keys(keys());
@@ -108,19 +159,57 @@ function keys() {
   const several = () => results.methods.length > 1;
   return [
     { keys: "Space / K", group: "Player", label: "Play or pause", run: () => player.toggle() },
-    { keys: "ArrowLeft / ,", group: "Player", label: "One frame back", run: () => player.step(-1), when: () => !view.pane.hasFocus },
-    { keys: "ArrowRight / .", group: "Player", label: "One frame on", run: () => player.step(1), when: () => !view.pane.hasFocus },
+    {
+      keys: "ArrowLeft / ,",
+      group: "Player",
+      label: "One frame back",
+      run: () => player.step(-1),
+      when: () => !view.pane.hasFocus,
+    },
+    {
+      keys: "ArrowRight / .",
+      group: "Player",
+      label: "One frame on",
+      run: () => player.step(1),
+      when: () => !view.pane.hasFocus,
+    },
     { keys: "Shift+ArrowLeft", group: "Player", label: "Ten frames back", run: () => player.step(-10) },
     { keys: "Shift+ArrowRight", group: "Player", label: "Ten frames on", run: () => player.step(10) },
     { keys: "N", group: "Player", label: "Next weak or lost frame", run: () => jump(1) },
     { keys: "Shift+N", group: "Player", label: "Previous weak or lost frame", run: () => jump(-1) },
     { keys: "Home", group: "Player", label: "First frame", run: () => player.go(0) },
     { keys: "End", group: "Player", label: "Last frame", run: () => player.go(Infinity) },
-    { keys: "[", group: "Excluding frames", label: "Selection begins at this frame", run: () => exclusions.begin(player.frame) },
-    { keys: "]", group: "Excluding frames", label: "Selection ends at this frame", run: () => exclusions.end(player.frame) },
-    { keys: "X", group: "Excluding frames", label: "Exclude the selection, or else this frame", run: () => exclusions.exclude(player.frame) },
-    { keys: "Escape", group: "Excluding frames", label: "Forget the selection", run: () => exclusions.forget(), when: () => exclusions.selection !== null },
-    ...LAYERS.map((entry) => ({ keys: entry.key, group: "Overlay", label: entry.name, run: () => setLayer(entry.layer, !layers.has(entry.layer)) })),
+    {
+      keys: "[",
+      group: "Excluding frames",
+      label: "Selection begins at this frame",
+      run: () => exclusions.begin(player.frame),
+    },
+    {
+      keys: "]",
+      group: "Excluding frames",
+      label: "Selection ends at this frame",
+      run: () => exclusions.end(player.frame),
+    },
+    {
+      keys: "X",
+      group: "Excluding frames",
+      label: "Exclude the selection, or else this frame",
+      run: () => exclusions.exclude(player.frame),
+    },
+    {
+      keys: "Escape",
+      group: "Excluding frames",
+      label: "Forget the selection",
+      run: () => exclusions.forget(),
+      when: () => exclusions.selection !== null,
+    },
+    ...LAYERS.map((entry) => ({
+      keys: entry.key,
+      group: "Overlay",
+      label: entry.name,
+      run: () => setLayer(entry.layer, !layers.has(entry.layer)),
+    })),
     { keys: "M", group: "Overlay", label: "Compare methods", run: () => compare(!compared), when: several },
     { keys: "V", group: "Looking", label: "Frame, both, 3-D", run: nextStage },
     { keys: "Z", group: "Looking", label: "Loupe", run: () => view.toggleLoupe() },
@@ -142,10 +231,17 @@ function onFrame({ frame, time_s }) {
 
 async function loadHistories() {
   const methods = compared ? results.methods : [method];
-  await Promise.all(results.targets.flatMap((name) => methods.map(async (wanted) => histories.set(`${wanted}/${name}`, await fetchHistory(page.id, name, wanted)))));
+  await Promise.all(
+    results.targets.flatMap((name) =>
+      methods.map(async (wanted) => histories.set(`${wanted}/${name}`, await fetchHistory(page.id, name, wanted))),
+    ),
+  );
   const main = current();
   if (main === undefined) return;
-  player.setFrames(main.time_s, worstStatuses(results.targets.map((name) => histories.get(`${method}/${name}`)?.status ?? [])));
+  player.setFrames(
+    main.time_s,
+    worstStatuses(results.targets.map((name) => histories.get(`${method}/${name}`)?.status ?? [])),
+  );
   exclusions.setFrames(main.time_s);
   drawPlots(main);
   showDoubtful();
@@ -190,13 +286,18 @@ function drawPlots(main) {
 function showSelection() {
   const selected = exclusions.interval;
   for (const plot of plots) {
-    plot.setIntervals(selected ? [{ key: "selection", label: "selected", from: selected[0], to: selected[1], colour: "--bad", editable: true }] : []);
+    plot.setIntervals(
+      selected
+        ? [{ key: "selection", label: "selected", from: selected[0], to: selected[1], colour: "--bad", editable: true }]
+        : [],
+    );
   }
 }
 
 /** @param {1 | -1} direction */
 function jump(direction) {
-  if (!player.jump(direction)) toast(direction > 0 ? "No weak or lost frame follows." : "No weak or lost frame comes before.");
+  if (!player.jump(direction))
+    toast(direction > 0 ? "No weak or lost frame follows." : "No weak or lost frame comes before.");
 }
 
 /** @param {string} name */
@@ -242,18 +343,38 @@ function nextStage() {
 function setLayer(layer, on) {
   if (on) layers.add(layer);
   else layers.delete(layer);
-  setView({ hidden: LAYERS.map((entry) => entry.layer).filter((name) => !layers.has(name)).join(",") || null });
+  setView({
+    hidden:
+      LAYERS.map((entry) => entry.layer)
+        .filter((name) => !layers.has(name))
+        .join(",") || null,
+  });
   showLayers();
   view.setLayers(layers);
 }
 
 function showLayers() {
-  const focused = document.activeElement instanceof HTMLInputElement && layerList.contains(document.activeElement) ? document.activeElement.name : "";
+  const focused =
+    document.activeElement instanceof HTMLInputElement && layerList.contains(document.activeElement)
+      ? document.activeElement.name
+      : "";
   const rows = LAYERS.map((entry) => {
-    const box = h("input", { type: "checkbox", name: entry.layer, checked: layers.has(entry.layer), onchange: () => setLayer(entry.layer, box.checked) });
+    const box = h("input", {
+      type: "checkbox",
+      name: entry.layer,
+      checked: layers.has(entry.layer),
+      onchange: () => setLayer(entry.layer, box.checked),
+    });
     const sign = h("span", { class: `layer-sign ${entry.sign}`, "aria-hidden": "true" });
     sign.style.setProperty("--sign", `var(${entry.colour})`);
-    return h("label", { class: "check layer" }, box, sign, h("span", { class: "grow" }, entry.name), h("kbd", { "aria-hidden": "true" }, entry.key.replace("Shift+", "⇧")));
+    return h(
+      "label",
+      { class: "check layer" },
+      box,
+      sign,
+      h("span", { class: "grow" }, entry.name),
+      h("kbd", { "aria-hidden": "true" }, entry.key.replace("Shift+", "⇧")),
+    );
   });
   fill(layerList, h("header", {}, h("h2", {}, "Overlay, as measured")), h("div", { class: "layers" }, rows));
   if (focused) find(`[name=${focused}]`, HTMLInputElement, layerList).focus();
@@ -263,14 +384,24 @@ function showDoubtful() {
   const runs = statusRuns(player.statuses).filter((run) => run.status === "weak" || run.status === "lost");
   const number = (/** @type {string} */ status) => player.statuses.filter((entry) => entry === status).length;
   const rows = runs.map((run) =>
-    h("button", { type: "button", class: "run-row run-jump", onclick: () => player.go(run.first) },
+    h(
+      "button",
+      { type: "button", class: "run-row run-jump", onclick: () => player.go(run.first) },
       h("span", { class: `status-key ${run.status}` }),
       h("span", { class: "number" }, run.first === run.last ? `${run.first}` : `${run.first}–${run.last}`),
       h("span", { class: "faint" }, run.status),
-      h("span", { class: "number faint end" }, `${fixed(player.times_s[run.first], 2)} s`)));
+      h("span", { class: "number faint end" }, `${fixed(player.times_s[run.first], 2)} s`),
+    ),
+  );
   fill(
     doubtful,
-    h("header", {}, h("h2", {}, "Weak and lost frames"), h("span", { class: `badge ${number("weak") ? "warn" : ""}` }, `${count(number("weak"))} weak`), h("span", { class: `badge ${number("lost") ? "bad" : ""}` }, `${count(number("lost"))} lost`)),
+    h(
+      "header",
+      {},
+      h("h2", {}, "Weak and lost frames"),
+      h("span", { class: `badge ${number("weak") ? "warn" : ""}` }, `${count(number("weak"))} weak`),
+      h("span", { class: `badge ${number("lost") ? "bad" : ""}` }, `${count(number("lost"))} lost`),
+    ),
     runs.length ? h("div", { class: "run-list" }, rows) : h("p", { class: "soft" }, "Every frame was measured well."),
   );
 }
@@ -282,18 +413,50 @@ function showFacts() {
   const status = main.status[i] ?? "ok";
   const turn = main.rotation_rad[i];
   const ground = view.review?.frame === i ? view.review.ground : null;
-  const row = (/** @type {"p1" | "p2"} */ point) => h("tr", {}, h("th", { scope: "row" }, point.toUpperCase()), /** @type {const} */ (["dx", "dy"]).map((axis) => displacementCell(main, i, point, axis)));
-  view.setCaption(`${methodName(method)} · frame ${i}${status === "ok" ? "" : ` · ${status}`}`, status === "weak" || status === "lost");
+  const row = (/** @type {"p1" | "p2"} */ point) =>
+    h(
+      "tr",
+      {},
+      h("th", { scope: "row" }, point.toUpperCase()),
+      /** @type {const} */ (["dx", "dy"]).map((axis) => displacementCell(main, i, point, axis)),
+    );
+  view.setCaption(
+    `${methodName(method)} · frame ${i}${status === "ok" ? "" : ` · ${status}`}`,
+    status === "weak" || status === "lost",
+  );
   fill(
     facts,
     h("header", {}, h("h2", {}, `Frame ${i}`), h("span", { class: `badge ${STATUS_TONES[status] ?? ""}` }, status)),
-    h("table", { class: "table facts-table", "aria-label": "Displacement in this frame" },
-      h("thead", {}, h("tr", {}, h("th", {}, "mm ± 1 σ"), h("th", { class: "number" }, "east"), h("th", { class: "number" }, "north"))),
-      h("tbody", {}, row("p1"), row("p2"))),
-    h("dl", { class: "facts" },
-      h("dt", {}, "Time"), h("dd", {}, `${fixed(main.time_s[i], 3)} s`),
-      h("dt", {}, "Rotation"), h("dd", {}, turn === null || turn === undefined ? "–" : `${fixed(turn * 1000, 2)} mrad`),
-      h("dt", {}, "Ground"), h("dd", {}, ground ? `${plural(ground.used.length, "feature")} used, ${count(ground.rejected.length)} rejected` : "…")),
+    h(
+      "table",
+      { class: "table facts-table", "aria-label": "Displacement in this frame" },
+      h(
+        "thead",
+        {},
+        h(
+          "tr",
+          {},
+          h("th", {}, "mm ± 1 σ"),
+          h("th", { class: "number" }, "east"),
+          h("th", { class: "number" }, "north"),
+        ),
+      ),
+      h("tbody", {}, row("p1"), row("p2")),
+    ),
+    h(
+      "dl",
+      { class: "facts" },
+      h("dt", {}, "Time"),
+      h("dd", {}, `${fixed(main.time_s[i], 3)} s`),
+      h("dt", {}, "Rotation"),
+      h("dd", {}, turn === null || turn === undefined ? "–" : `${fixed(turn * 1000, 2)} mrad`),
+      h("dt", {}, "Ground"),
+      h(
+        "dd",
+        {},
+        ground ? `${plural(ground.used.length, "feature")} used, ${count(ground.rejected.length)} rejected` : "…",
+      ),
+    ),
   );
 }
 
@@ -302,5 +465,10 @@ function displacementCell(history, i, point, axis) {
   const value = history[`${point}_${axis}_m`][i];
   const sigma = history[`${point}_${axis}_sigma_m`][i];
   if (value === null || value === undefined) return h("td", { class: "number" }, "–");
-  return h("td", { class: "number" }, fixed(value * 1000, 1), h("span", { class: "faint" }, sigma === null ? "" : ` ± ${fixed(sigma * 1000, 2)}`));
+  return h(
+    "td",
+    { class: "number" },
+    fixed(value * 1000, 1),
+    h("span", { class: "faint" }, sigma === null ? "" : ` ± ${fixed(sigma * 1000, 2)}`),
+  );
 }

@@ -21,7 +21,13 @@ import { announce, toastError } from "../components/toast.js";
 // The stage of a measurement that counts frames; the others are short.
 const MEASURING = "measuring";
 /** @type {Record<string, string>} */
-const STAGES = { cloud: "Reading the cloud", measuring: "Measuring frames", solving: "Solving", orthoimage: "Making the orthoimage", "drawing figures": "Drawing figures" };
+const STAGES = {
+  cloud: "Reading the cloud",
+  measuring: "Measuring frames",
+  solving: "Solving",
+  orthoimage: "Making the orthoimage",
+  "drawing figures": "Drawing figures",
+};
 /** Where each part of project.json is decided. @type {{path: string, step: import("../lib/types.js").StepName, name: string}[]} */
 const PLACES = [
   { path: "inputs", step: "inputs", name: "Inputs" },
@@ -50,23 +56,51 @@ const targetChoice = segmented({ label: "Target", choices: [], value: target, on
 const live = h("span", { class: "badge accent", hidden: true }, "Growing as frames arrive");
 const plotArea = h("div", { class: "plot-stack" });
 const controls = h("section", { class: "section", "aria-label": "Measurement" });
-const methods = h("section", { class: "section" }, h("header", {}, h("h2", {}, "Method")), h("div", { class: "choices", role: "radiogroup", "aria-label": "Method" }));
+const methods = h(
+  "section",
+  { class: "section" },
+  h("header", {}, h("h2", {}, "Method")),
+  h("div", { class: "choices", role: "radiogroup", "aria-label": "Method" }),
+);
 const facts = h("section", { class: "section", "aria-label": "Result" });
 const empty = h("div", { class: "stage-empty", hidden: true });
 fill(
   find("#main"),
-  h("div", { class: "stage" },
+  h(
+    "div",
+    { class: "stage" },
     h("div", { class: "stage-bar" }, h("h1", {}, "Track"), targetChoice.element, h("span", { class: "spring" }), live),
-    h("div", { class: "stage-body padded" }, plotArea, empty)),
+    h("div", { class: "stage-body padded" }, plotArea, empty),
+  ),
   h("aside", { class: "side", "aria-label": "Run" }, controls, methods, facts),
 );
-const plots = AXES.map((axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "track", drag: "view", leastSpan: 0.02 }));
+const plots = AXES.map(
+  (axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "track", drag: "view", leastSpan: 0.02 }),
+);
 plots.forEach((plot, i) => plot.setTraces([{ label: "P1", colour: i === 0 ? "--series-1" : "--series-2" }], [[], []]));
 
 page.keys([
-  { keys: "R", group: "Track", label: "Start or resume", run: () => void start(false), when: () => !isRunning(track.job) && !blocked() },
-  { keys: "Shift+R", group: "Track", label: "Measure again from the first frame", run: () => void start(true), when: () => !isRunning(track.job) && !blocked() },
-  { keys: "C", group: "Track", label: "Cancel; what is measured is kept", run: () => void cancel(), when: () => isRunning(track.job) },
+  {
+    keys: "R",
+    group: "Track",
+    label: "Start or resume",
+    run: () => void start(false),
+    when: () => !isRunning(track.job) && !blocked(),
+  },
+  {
+    keys: "Shift+R",
+    group: "Track",
+    label: "Measure again from the first frame",
+    run: () => void start(true),
+    when: () => !isRunning(track.job) && !blocked(),
+  },
+  {
+    keys: "C",
+    group: "Track",
+    label: "Cancel; what is measured is kept",
+    run: () => void cancel(),
+    when: () => isRunning(track.job),
+  },
 ]);
 store.on("change", show);
 page.events.on("hello", () => void catchUp());
@@ -105,7 +139,15 @@ async function loadHistory() {
   const name = currentTarget();
   try {
     const history = await fetchHistory(page.id, name);
-    rows.set(name, new Map(history.frame.map((frame, i) => [frame, [frame, history.time_s[i], history.p1_dx_m[i], history.p1_dy_m[i], history.status[i]]])));
+    rows.set(
+      name,
+      new Map(
+        history.frame.map((frame, i) => [
+          frame,
+          [frame, history.time_s[i], history.p1_dx_m[i], history.p1_dy_m[i], history.status[i]],
+        ]),
+      ),
+    );
   } catch (error) {
     toastError(error);
   }
@@ -209,7 +251,9 @@ function showControls() {
     ...problems.map(problemNote),
     job?.state === "failed" ? note("bad", job.message ?? "The measurement failed.") : null,
     problems.length === 0 && track.resumable ? note("info", stoppedWords()) : null,
-    problems.length === 0 && results?.stale ? note("warn", store.state.steps.track.message || "The project has changed since these results were made.") : null,
+    problems.length === 0 && results?.stale
+      ? note("warn", store.state.steps.track.message || "The project has changed since these results were made.")
+      : null,
     done && job?.state !== "failed" ? note("good", doneWords()) : null,
     ...(done ? (results?.summary?.warnings ?? []) : []).map((/** @type {string} */ warning) => note("warn", warning)),
   ];
@@ -228,9 +272,23 @@ function problemNote(problem) {
 function buttons(done) {
   const off = blocked();
   const first = track.resumable ? "Resume" : results?.stale ? "Update results" : "Start";
-  const go = h("button", { type: "button", class: `button ${done ? "" : "primary"}`, disabled: off, onclick: () => void start(done) }, icon(done ? "refresh" : "play"), done ? "Measure again" : first);
-  const again = h("button", { type: "button", class: "button quiet", disabled: off, onclick: () => void start(true) }, "Start from the first frame");
-  const onwards = h("a", { class: "button primary", href: stepUrl(page.id, "review") }, "Review the result", icon("arrow_right"));
+  const go = h(
+    "button",
+    { type: "button", class: `button ${done ? "" : "primary"}`, disabled: off, onclick: () => void start(done) },
+    icon(done ? "refresh" : "play"),
+    done ? "Measure again" : first,
+  );
+  const again = h(
+    "button",
+    { type: "button", class: "button quiet", disabled: off, onclick: () => void start(true) },
+    "Start from the first frame",
+  );
+  const onwards = h(
+    "a",
+    { class: "button primary", href: stepUrl(page.id, "review") },
+    "Review the result",
+    icon("arrow_right"),
+  );
   return h("div", { class: "toolbar" }, done ? [onwards, go] : [go, track.resumable || results?.stale ? again : null]);
 }
 
@@ -241,21 +299,34 @@ function showRunning(job) {
   const title = job.state === "queued" ? "Waiting for its turn" : (STAGES[job.stage] ?? (job.stage || "Starting"));
   fill(
     controls,
-    h("header", {}, h("h2", {}, title), h("span", { class: "number soft" }, share === null ? "" : `${fixed(100 * share, 0)} %`)),
+    h(
+      "header",
+      {},
+      h("h2", {}, title),
+      h("span", { class: "number soft" }, share === null ? "" : `${fixed(100 * share, 0)} %`),
+    ),
     bar,
     job.stage === MEASURING ? measuringFigures(job) : null,
     h("p", { class: "small faint" }, "You may close this tab: the measurement goes on, and every frame is kept."),
-    h("div", { class: "toolbar" }, h("button", { type: "button", class: "button", onclick: () => void cancel() }, icon("close"), "Cancel")),
+    h(
+      "div",
+      { class: "toolbar" },
+      h("button", { type: "button", class: "button", onclick: () => void cancel() }, icon("close"), "Cancel"),
+    ),
   );
 }
 
 /** @param {Job} job */
 function measuringFigures(job) {
-  const figure = (/** @type {string} */ value, /** @type {string} */ name) => h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
-  return h("div", { class: "figures" },
+  const figure = (/** @type {string} */ value, /** @type {string} */ name) =>
+    h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
+  return h(
+    "div",
+    { class: "figures" },
     figure(`${count(job.done)} / ${count(job.total)}`, "frames"),
     figure(job.rate_per_s ? fixed(job.rate_per_s, 1) : "–", "frames/s"),
-    figure(duration(job.seconds_left), "left"));
+    figure(duration(job.seconds_left), "left"),
+  );
 }
 
 function stoppedWords() {
@@ -264,43 +335,68 @@ function stoppedWords() {
 
 function doneWords() {
   const { frames, frames_measured, seconds, frames_per_second } = results?.summary ?? {};
-  const speed = frames_measured && frames_per_second ? ` in ${duration(seconds)}, ${fixed(frames_per_second, 1)} frames/s` : "";
+  const speed =
+    frames_measured && frames_per_second ? ` in ${duration(seconds)}, ${fixed(frames_per_second, 1)} frames/s` : "";
   return `Measured ${plural(frames ?? track.frames_total, "frame")}${speed}.`;
 }
 
 function showMethods() {
   const box = find(".choices", HTMLElement, methods);
   const focused = box.contains(document.activeElement);
-  fill(box, METHODS.map((method) => {
-    const on = store.project.method === method.value;
-    const input = h("input", { type: "radio", name: "method", value: method.value, checked: on, disabled: isRunning(track.job), onchange: () => chooseMethod(method.value) });
-    return h("label", { class: `choice ${on ? "on" : ""}` }, input, h("span", {}, h("strong", {}, method.name), h("span", { class: "small soft" }, method.line)));
-  }));
+  fill(
+    box,
+    METHODS.map((method) => {
+      const on = store.project.method === method.value;
+      const input = h("input", {
+        type: "radio",
+        name: "method",
+        value: method.value,
+        checked: on,
+        disabled: isRunning(track.job),
+        onchange: () => chooseMethod(method.value),
+      });
+      return h(
+        "label",
+        { class: `choice ${on ? "on" : ""}` },
+        input,
+        h("span", {}, h("strong", {}, method.name), h("span", { class: "small soft" }, method.line)),
+      );
+    }),
+  );
   if (focused) /** @type {HTMLElement | null} */ (box.querySelector("input:checked"))?.focus();
 }
 
 /** @param {"geometric" | "paper"} method */
 function chooseMethod(method) {
   const name = METHODS.find((entry) => entry.value === method)?.name ?? method;
-  void store.edit(`Method: ${name}`, (draft) => {
-    draft.method = method;
-    draft.drift.filter = method === "paper" ? "high-pass" : "none";
-  }).then(() => loadResults()).catch((error) => announce(sentence(error)));
+  void store
+    .edit(`Method: ${name}`, (draft) => {
+      draft.method = method;
+      draft.drift.filter = method === "paper" ? "high-pass" : "none";
+    })
+    .then(() => loadResults())
+    .catch((error) => announce(sentence(error)));
 }
 
 function showFacts() {
   const counts = results?.summary?.targets?.[currentTarget()]?.counts;
   facts.hidden = !results?.ready || !counts || isRunning(track.job);
   if (facts.hidden) return;
-  const statusLine = (/** @type {string} */ status, /** @type {string} */ words) => [h("dt", {}, h("span", { class: `status-key ${status}` }), status), h("dd", {}, `${count(counts[status] ?? 0)} `, h("span", { class: "faint" }, words))];
+  const statusLine = (/** @type {string} */ status, /** @type {string} */ words) => [
+    h("dt", {}, h("span", { class: `status-key ${status}` }), status),
+    h("dd", {}, `${count(counts[status] ?? 0)} `, h("span", { class: "faint" }, words)),
+  ];
   fill(
     facts,
     h("header", {}, h("h2", {}, "Frames")),
-    h("dl", { class: "facts" },
+    h(
+      "dl",
+      { class: "facts" },
       statusLine("ok", "measured"),
       statusLine("weak", "measured from few points"),
       statusLine("lost", "could not be measured"),
-      statusLine("excluded", "rejected by you")),
+      statusLine("excluded", "rejected by you"),
+    ),
     h("header", {}, h("h2", {}, "Quality")),
     h("dl", { class: "facts" }, qualityFacts()),
   );
@@ -308,13 +404,29 @@ function showFacts() {
 
 /** What the engine says of its own fits. */
 function qualityFacts() {
-  const { reference_fit: reference, ground_fit: ground, self_calibration: calibration, targets } = results?.summary ?? {};
+  const {
+    reference_fit: reference,
+    ground_fit: ground,
+    self_calibration: calibration,
+    targets,
+  } = results?.summary ?? {};
   const sigma = targets?.[currentTarget()]?.sigma_median_m;
-  const fact = (/** @type {string} */ name, /** @type {string} */ value, /** @type {string} */ words = "") => [h("dt", {}, name), h("dd", {}, value, words && h("span", { class: "faint" }, ` ${words}`))];
+  const fact = (/** @type {string} */ name, /** @type {string} */ value, /** @type {string} */ words = "") => [
+    h("dt", {}, name),
+    h("dd", {}, value, words && h("span", { class: "faint" }, ` ${words}`)),
+  ];
   return [
-    reference ? fact("Reference", pixels(reference.rms_px), `RMS, ${pixels(reference.left_out_rms_px)} leave-one-out`) : [],
+    reference
+      ? fact("Reference", pixels(reference.rms_px), `RMS, ${pixels(reference.left_out_rms_px)} leave-one-out`)
+      : [],
     ground ? fact("Ground", `${count(ground.median_inliers)} features`, `a frame, ${pixels(ground.rms_px)} RMS`) : [],
     sigma ? fact("Noise", `${millimetres(sigma.x, 2)} / ${millimetres(sigma.y, 2)}`, "1 σ, east / north") : [],
-    calibration?.rms_after_m ? fact("At rest", millimetres(calibration.rms_after_m, 2), `RMS after self-calibration, ${millimetres(calibration.rms_before_m, 2)} before`) : [],
+    calibration?.rms_after_m
+      ? fact(
+          "At rest",
+          millimetres(calibration.rms_after_m, 2),
+          `RMS after self-calibration, ${millimetres(calibration.rms_before_m, 2)} before`,
+        )
+      : [],
   ].flat();
 }
