@@ -88,7 +88,8 @@ def _spread_corners(luma: Luma, allowed: NDArray[np.bool_], count: int) -> Float
     points = points[strengths > max(floor, 1e-7)]
     # Corners sit on whole pixels; spread over all sub-pixel phases, interpolation errors average out.
     golden = (np.arange(len(points))[:, None] * np.array([0.7548776662, 0.5698402910])) % 1.0 - 0.5
-    points = points + golden
+    # In steps that a recording keeps exactly, so that a resumed run looks at the very same places.
+    points = points + np.rint(golden * 1024) / 1024
     border = HALF_PX + MARGIN_PX + 1
     inside = (points >= border).all(axis=1) & (points < np.array([width, height]) - 1 - border).all(axis=1)
     return np.asarray(points[inside], dtype=np.float64)

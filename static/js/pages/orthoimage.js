@@ -316,14 +316,16 @@ function showRaster({ ready, stale, grid: raster, measured_share, filled_share, 
   fill(make, ready ? "Make it again" : "Make the orthoimage");
   make.className = `button ${ready && !stale ? "" : "primary"}`;
   if (raster === null || !ready) return fill(facts);
-  const share = (/** @type {number | null} */ value) => `${fixed(100 * (value ?? 0), 0)} %`;
+  const share = (/** @type {number} */ value) => `${fixed(100 * value, 0)} %`;
   const rows = [
     [
       "Size",
       `${raster.width} × ${raster.height} px, ${metres(raster.width * raster.pixel_size_m, 1)} × ${metres(raster.height * raster.pixel_size_m, 1)}`,
     ],
-    ["Measured", `${share(measured_share)} of the pixels, ${share(filled_share)} filled from neighbours`],
   ];
+  // An orthoimage made by `rooftrack run` says nothing of how it was filled.
+  if (measured_share !== null && filled_share !== null)
+    rows.push(["Measured", `${share(measured_share)} of the pixels, ${share(filled_share)} filled from neighbours`]);
   fill(
     facts,
     h(
