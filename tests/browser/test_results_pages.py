@@ -21,7 +21,7 @@ from tests.browser.live import ask, chromium, free_port, measured_scene, serving
 FRAMES = 240
 FRAME = 120  # in the middle of the shaking
 WITHIN_PX = 0.5
-WITHIN_NOISE_M = 0.001
+SAME_M = 1e-5  # the contract's: what stopping and going on may change
 
 
 @pytest.fixture(scope="module")
@@ -86,8 +86,7 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
     assert downloaded == (tmp_path / "small" / "results" / "roof.csv").read_bytes()
     resumed, straight = (read_history_csv(folder / "results" / "roof.csv") for folder in (tmp_path / "small", scene))
     assert resumed.status.tolist() == straight.status.tolist()
-    # A run that goes on predicts its first frame afresh, so patches and edges settle elsewhere within their noise.
-    assert np.abs(resumed.p1_m - straight.p1_m).max() < WITHIN_NOISE_M
+    assert np.abs(resumed.p1_m - straight.p1_m).max() < SAME_M
 
 
 def eventually(holds, seconds=20.0):
