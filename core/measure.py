@@ -27,7 +27,7 @@ from core.progress import CancelToken, Progress, silent
 from core.video import Luma, frame_index, read_frame, read_frames
 
 # Frames measured before a chunk's first and thrown away: predictions have forgotten their beginning by then.
-WARM_UP = 4
+WARM_UP = 6
 # Frames per task of a cluster: long enough that finding the way in costs little, short enough to lose little.
 CLUSTER_CHUNK = 240
 
