@@ -25,8 +25,8 @@ Singles = NDArray[np.float32]
 HALF_PX = 10  # patches of 21 x 21 pixels: 400 of them are 0.18 megapixel
 MARGIN_PX = 6  # room for deformation and for the interpolation kernel
 OVERSAMPLING = 2  # linear interpolation between half pixels errs below the noise of 8-bit video
-MAX_ITERATIONS = 10
-CONVERGED_PX = 0.004  # each step leaves about a tenth of its own length
+MAX_ITERATIONS = 12
+CONVERGED_PX = 0.001  # each step leaves about a tenth of its own length
 # A patch that wanders further than this from its prediction has lost its own minimum.
 MAX_WANDER_PX = 5.0
 
