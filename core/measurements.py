@@ -24,7 +24,6 @@ from core.following import Apparent
 
 # At most this much work is lost when the machine stops.
 COMMIT_EVERY_S = 0.8
-FORMAT = 1
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS recordings (
     id INTEGER PRIMARY KEY, method TEXT NOT NULL, fingerprint TEXT NOT NULL, finished INTEGER NOT NULL DEFAULT 0,
