@@ -11,8 +11,9 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -24,6 +25,7 @@ from core.run import run_project
 from sample_data.catalogue import build
 from sample_data.make import make
 
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "sample"
 CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -84,11 +86,6 @@ def _note_outside(url: str, address: str, troubles: list[str]) -> None:
         troubles.append(f"asked {url}")
 
 
-def _note_failure(status: int, url: str, troubles: list[str]) -> None:
-    if status >= 500:
-        troubles.append(f"{status} {url}")
-
-
 def shared_folder(factory: pytest.TempPathFactory) -> Path:
     """A folder of this session that all its test processes see."""
     own = factory.getbasetemp()
@@ -96,21 +93,38 @@ def shared_folder(factory: pytest.TempPathFactory) -> Path:
 
 
 def measured_scene(shared: Path) -> Path:
-    """Return a project folder with the rendered small scene and the headless engine's results, made once a session.
+    """Return a project folder with the rendered small scene and the headless engine's results, made once a session."""
+    return _measured_once(shared, lambda folder: make(build("small", seed=1), folder))
 
-    Several test processes may ask; one makes it while the others wait.
-    """
+
+def measured_sample(shared: Path) -> Path:
+    """Return a copy of the shipped sample with the headless engine's results, made once a session."""
+    return _measured_once(
+        shared, lambda folder: shutil.copytree(SAMPLE, folder, ignore=shutil.ignore_patterns("results"))
+    )
+
+
+def _measured_once(shared: Path, begin: Callable[[Path], object]) -> Path:
+    """Several test processes may ask; one makes the project while the others wait."""
     shared.mkdir(parents=True, exist_ok=True)
     folder = shared / "scene"
     with (shared / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / "results" / "summary.json").exists():
-            make(build("small", seed=1), folder)
+            begin(folder)
             run_project(folder)
     return folder
 
 
+def eventually(holds: Callable[[], bool], seconds: float = 20.0) -> None:
+    """Wait for what the page saves by itself."""
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "the project was not saved in time"
+        time.sleep(0.1)
+
+
 def ask(pages: str, path: str) -> Any:
     """Return what the server answers about a project, given the address of its pages."""
-    with urllib.request.urlopen(f"{pages.replace('/p/', '/api/projects/')}/{path}") as answer:
+    with urllib.request.urlopen(f"{pages.replace('/p/', '/api/projects/')}/{path}".rstrip("/")) as answer:
         return json.load(answer)

@@ -7,7 +7,6 @@ import re
 import shutil
 import urllib.request
 from io import BytesIO
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,20 +16,23 @@ from playwright.sync_api import Page, expect
 
 from core.lens import read_lens
 from core.project import read_project
-from tests.browser.hands import centre_of, click_at, fitted, zoomed
-from tests.browser.live import ask, chromium, free_port, serving, watched
+from tests.browser.hands import centre_of, fitted, zoomed
+from tests.browser.live import SAMPLE, ask, free_port, serving, watched
+from tests.browser.steps import (
+    FRAME_SIZE,
+    draw_bands,
+    make_orthoimage,
+    ortho_px,
+    outline,
+    pane,
+    ready,
+    saved,
+    tell_height,
+)
 
-SAMPLE = Path(__file__).parents[2] / "sample_data" / "sample"
-FRAME_SIZE = read_lens(SAMPLE / "lens.yaml").image_size_px
 WITHIN_PX = 0.5
 # A click falls on a whole CSS pixel, and the wheel has zoomed to six or more of them per pixel of the picture.
 CLICK_PX = 0.15
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")
@@ -60,80 +62,12 @@ def truth():
     return read_project(SAMPLE)
 
 
-def saved(page: Page) -> None:
-    expect(page.locator(".save-state")).to_have_attribute("data-state", "saved")
-
-
-def pane(page: Page, name: str):
-    return page.get_by_role("application", name=re.compile(f"^{name}"))
-
-
-def ready(page: Page, name: str) -> None:
-    """Wait until a pane shows its picture."""
-    expect(pane(page, name)).to_have_attribute("data-picture", re.compile(r"\d+x\d+"), timeout=20_000)
-
-
 def pixels(page: Page) -> np.ndarray:
     """Return what the window shows without marks and captions, grey, device px."""
     page.evaluate("document.querySelectorAll('.pane > *:not(canvas)').forEach(e => e.style.visibility = 'hidden')")
     picture = Image.open(BytesIO(page.screenshot())).convert("L")
     page.evaluate("document.querySelectorAll('.pane > *').forEach(e => e.style.visibility = '')")
     return np.asarray(picture, dtype=np.float32)
-
-
-def test_a_new_project_from_files_gets_its_orthoimage_and_twenty_pairs_by_real_clicks(browser, server, truth):
-    workspace, address = server
-    with watched(browser, address) as page:
-        page.goto(address)
-        page.get_by_role("button", name="New project").first.click()
-        page.get_by_label("Name", exact=True).fill("by-hand")
-        for kind, file in (("video", "video.mp4"), ("cloud", "site.laz"), ("lens", "lens.yaml")):
-            page.locator(f".source-row[data-kind={kind}]").get_by_role("button").click()
-            files = page.get_by_role("listbox", name="Files")
-            if files.get_by_role("option", name="footage").count() or kind == "video":
-                files.get_by_role("option", name="footage").click()
-            files.get_by_role("option", name=file).dblclick()
-        page.get_by_role("button", name="Create").click()
-        page.wait_for_url("**/p/by-hand/inputs")
-        for kind in ("video", "cloud", "lens"):
-            badge = page.locator(f".input-card[data-kind={kind}] .badge")
-            expect(badge).to_have_text("understood", timeout=60_000)  # a cloud is read in a job
-        expect(page.locator(".input-card[data-kind=video]")).to_contain_text("{} × {} px".format(*FRAME_SIZE))
-
-        page.goto(f"{address}/p/by-hand/orthoimage?view=picture")
-        page.get_by_label("Pixel on the ground").fill("2.5")
-        page.keyboard.press("Enter")
-        page.get_by_role("button", name="Make the orthoimage").click()
-        expect(page.locator("#raster-state")).to_have_text("made", timeout=60_000)
-
-        page.goto(f"{address}/p/by-hand/correspondences")
-        ready(page, "Reference frame"), ready(page, "Orthoimage")
-        grid = ask(f"{address}/p/by-hand", "orthoimage")["grid"]
-        size = (grid["width"], grid["height"])
-        for placed, pair in enumerate(truth.correspondences):
-            click_at(page, pane(page, "Reference frame"), FRAME_SIZE, np.array(pair.frame_px))
-            if placed == 4:
-                ghost = page.locator("[data-id='ghost-5']")
-                expect(ghost).to_have_count(1)
-                page.reload()  # neither the half nor its ghost is lost, and neither counts
-                ready(page, "Reference frame"), ready(page, "Orthoimage")
-                expect(ghost).to_have_count(1)
-                assert len(read_project(workspace / "by-hand").correspondences) == 4
-            click_at(page, pane(page, "Orthoimage"), size, ortho_px(grid, pair.ground_m))
-            expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(placed + 1)
-        expect(page.locator("#fit")).to_contain_text("RMS")
-        saved(page)
-
-    made = read_project(workspace / "by-hand").correspondences
-    clicks = np.array([pair.frame_px for pair in made]) - [pair.frame_px for pair in truth.correspondences]
-    ground = np.array([pair.ground_m for pair in made]) - [pair.ground_m for pair in truth.correspondences]
-    assert np.abs(clicks).max() < CLICK_PX
-    assert np.abs(ground).max() < CLICK_PX * grid["pixel_size_m"] * 2
-
-
-def ortho_px(grid, ground_m):
-    g = grid["pixel_size_m"]
-    return np.array([(ground_m[0] - grid["west_m"]) / g - 0.5, (grid["north_m"] - ground_m[1]) / g - 0.5])
 
 
 @pytest.mark.parametrize("ratio", [1, 2])
@@ -269,26 +203,13 @@ def test_regions_and_bands_are_drawn_and_previewed_as_the_engine_sees_them(brows
         page.goto(f"{pages}/regions")
         ready(page, "Reference frame"), ready(page, "Orthorectified")
         frame, plan = pane(page, "Reference frame"), pane(page, "Orthorectified")
-        for corner in (regions[0][i] for i in (0, 1, 3, 4)):
-            page.mouse.click(*np.round(fitted(page, frame, FRAME_SIZE).window(np.array(corner))))
-            page.wait_for_timeout(400)  # two clicks within a third of a second are a double click
-        page.keyboard.press("Enter")
+        outline(page, frame, FRAME_SIZE, [regions[0][i] for i in (0, 1, 3, 4)])
         expect(page.locator("#moving .badge")).to_have_text("4 corners")
         grid = ask(pages, "rectified")["grid"]
         size = (grid["width"], grid["height"])
-        for line in ("L1", "L2", "T1"):
-            band = target["lines"][line]
-            ends = np.array([band["from_m"], band["to_m"]])
-            along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
-            beside = ends.mean(axis=0) + np.array([-along[1], along[0]]) * band["width_m"] / 2
-            for place in (*ends, beside):
-                click_at(page, plan, size, ortho_px(grid, place))
-            expect(page.locator(f".band-row[data-line={line}] .found")).to_contain_text("points")
+        draw_bands(page, grid, truth.targets[0].lines)
         expect(page.locator("#targets li[data-target=roof]")).to_be_visible()
-        page.get_by_label("Height above ground").fill(str(target["height_m"]))
-        page.get_by_label("P1–P2 distance").fill("1.22")
-        page.keyboard.press("Enter")
-        saved(page)
+        tell_height(page, target["height_m"], target["p1_p2_m"])
         made = read_project(folder).targets[0]
         for line in ("L1", "L2", "T1"):
             drawn, given = getattr(made.lines, line), target["lines"][line]
@@ -425,12 +346,7 @@ def test_a_clicked_height_and_a_region_make_a_target_of_points(browser, project,
     (folder / "project.json").write_text(json.dumps(document | {"inputs": inputs, "targets": []}))
     roof = document["targets"][0]["lines"]
     with watched(browser, pages) as page:
-        page.goto(f"{pages}/orthoimage?view=picture")
-        page.get_by_label("Pixel on the ground").fill("4")
-        page.keyboard.press("Enter")
-        saved(page)
-        page.get_by_role("button", name="Make the orthoimage").click()
-        expect(page.locator("#raster-state")).to_have_text("made", timeout=60_000)
+        make_orthoimage(page, pages, "4")
         ready(page, "Orthoimage")
         grid = ask(pages, "orthoimage")["grid"]
         place = np.array(truth.inputs.gps.at_m) + [1.5, 0.3]  # beside the antenna, on the roof
@@ -448,12 +364,8 @@ def test_a_clicked_height_and_a_region_make_a_target_of_points(browser, project,
         page.get_by_role("menuitem", name="Textured region").click()
         grid = ask(pages, "rectified")["grid"]
         plan = pane(page, "Orthorectified")
-        lies = fitted(page, plan, (grid["width"], grid["height"]))
         corners = [roof["L1"]["from_m"], roof["L1"]["to_m"], roof["L2"]["to_m"], roof["L2"]["from_m"]]
-        for corner in corners:
-            page.mouse.click(*np.round(lies.window(ortho_px(grid, corner))))
-            page.wait_for_timeout(400)
-        page.keyboard.press("Enter")
+        outline(page, plan, (grid["width"], grid["height"]), [ortho_px(grid, corner) for corner in corners])
         page.get_by_label("Height above ground").fill("18.3")
         page.keyboard.press("Enter")
         saved(page)

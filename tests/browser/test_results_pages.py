@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from core.drift import high_pass
 from core.project import read_project
 from core.results import read_history_csv
 from core.run import run_project
-from tests.browser.live import ask, chromium, free_port, measured_scene, serving, shared_folder, watched
+from tests.browser.live import ask, eventually, free_port, measured_scene, serving, shared_folder, watched
 
 FRAMES = 240
 FRAME = 120  # in the middle of the shaking
@@ -27,12 +26,6 @@ SAME_M = 1e-5  # the contract's: what stopping and going on may change
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     return measured_scene(shared_folder(tmp_path_factory) / "measured-scene")
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")
@@ -87,14 +80,6 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
     resumed, straight = (read_history_csv(folder / "results" / "roof.csv") for folder in (tmp_path / "small", scene))
     assert resumed.status.tolist() == straight.status.tolist()
     assert np.abs(resumed.p1_m - straight.p1_m).max() < SAME_M
-
-
-def eventually(holds, seconds=20.0):
-    """Wait for what the page saves by itself."""
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end, "the project was not saved in time"
-        time.sleep(0.1)
 
 
 def at_rest(page: Page, frame: int) -> None:
