@@ -2,18 +2,39 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from functools import lru_cache
 from pathlib import Path
 
 from app.frames import Fingerprint
+from core.errors import InputError
 from core.video import Luma, read_frame
 
+# Whoever asks for a frame that is just being decoded waits for it, and does not decode it too.
+_decoding = threading.Lock()
 
-@lru_cache(maxsize=3)
+
 def luma_of(video: Fingerprint, number: int) -> Luma:
     """Return the luma plane of a frame.
 
     Raises:
         InputError: there is no such frame.
     """
+    with _decoding:
+        return _luma_of(video, number)
+
+
+def prepare_luma(video: Fingerprint, number: int) -> None:
+    """Have a frame decoded, since somebody opened the page on which it will be drawn on."""
+
+    def decode() -> None:
+        with contextlib.suppress(InputError):
+            luma_of(video, number)
+
+    threading.Thread(target=decode, name="reference luma", daemon=True).start()
+
+
+@lru_cache(maxsize=3)
+def _luma_of(video: Fingerprint, number: int) -> Luma:
     return read_frame(Path(video[0]), number).luma

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from core.video import Luma
 
 # Points of a band's long side, which the lens bends in the raw frame.
 _SIDE_POINTS = 17
+# While one band is dragged the others stay as they are: they need not be looked for again.
+_KEPT_LINES = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +79,19 @@ class TargetPreview:
     message: str
 
 
+class _Frame:
+    """A frame and the fit of its pairs, equal to another that holds the very same ones."""
+
+    def __init__(self, luma: Luma, fit: ReferenceFit) -> None:
+        self.luma, self.fit = luma, fit
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Frame) and self.luma is other.luma and self.fit is other.fit
+
+    def __hash__(self) -> int:
+        return hash((id(self.luma), id(self.fit)))
+
+
 def preview_target(luma: Luma, target: Target, fit: ReferenceFit) -> TargetPreview:
     """Return what is found of a target in the reference frame; what is not found is said in words.
 
@@ -109,7 +125,8 @@ def preview_bands(
         height_m: of the target, where known.
         p1_p2_m: distance of P1 and P2, where known, to compare with.
     """
-    lines = {line: _preview_line(luma, band, fit, f"targets.{name}.lines.{line}") for line, band in bands.items()}
+    seen = _Frame(luma, fit)
+    lines = {line: _preview_line(seen, band, f"targets.{name}.lines.{line}") for line, band in bands.items()}
     p1, p2 = (_crossing(lines.get(line), lines.get("T1"), height_m, fit) for line in ("L1", "L2"))
     message = ""
     if p1 and p2 and p1_p2_m is not None and p1.world_m is not None and p2.world_m is not None:
@@ -124,7 +141,9 @@ def band_outline(band: Band) -> Floats:
     return np.concatenate([_between(*corners[:2]), _between(*corners[2:])])
 
 
-def _preview_line(luma: Luma, band: Band, fit: ReferenceFit, name: str) -> LinePreview:
+@lru_cache(maxsize=_KEPT_LINES)
+def _preview_line(frame: _Frame, band: Band, name: str) -> LinePreview:
+    luma, fit = frame.luma, frame.fit
     ends = np.array([band.from_m, band.to_m])
     band_plan = _corners(ends, band.width_m)
     band_raw = fit.raw_from_plan(band_outline(band))

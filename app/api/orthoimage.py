@@ -11,7 +11,8 @@ from fastapi import APIRouter, Query, Response
 from app import orthoimages
 from app.context import Context, Folder, Here
 from app.errors import ApiError, NotYet
-from app.frames import Picture, jpeg_of
+from app.frames import Picture, fingerprint, jpeg_of
+from app.lumas import prepare_luma
 from app.reference import H_plan_und, coarser, grid_of_frame, reference_fit
 from app.sites import site_key
 from app.store import ProjectFolder, problem_of
@@ -76,6 +77,7 @@ def rectified(folder: Folder, here: Here, pixels: Pixels = _PIXELS) -> dict[str,
         fit = reference_fit(here, folder, project)
     except (InputError, ApiError) as error:
         return {"ready": False, "message": problem_of(error), "grid": None}
+    prepare_luma(fingerprint(folder.require_input("video", project)), project.reference_frame)
     return {"ready": True, "message": "", "grid": vars(coarser(plan_grid(folder, project, fit), pixels))}
 
 
