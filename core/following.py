@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from core.coordinates import Floats, apply_homography, finite_rows
 from core.ground import LEAST_SCORE, choose_features_within, homography_jacobian
 from core.lens import Lens
-from core.motion import LineSet, RigidFit, fit_line, is_determined, rigid_from_lines, rigid_from_points
+from core.motion import LineSet, RigidFit, fit_line, is_determined, rigid_from_points, rough_rigid_from_lines
 from core.patches import PatchTracker
 from core.project import LINE_NAMES, Target
 from core.roof_lines import NOT_FOUND, STATIONS, LineMatch, LineTracker
@@ -158,15 +158,14 @@ class LinesFollower:
     def _measure(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent) -> TargetMatch:
         to_raw = self._mapping(H_ray_ray0, predicted)
         matches = [tracker.find(luma, to_raw, search_px=self._search_px) for tracker in self.trackers]
-        apparent = self._apparent(matches, H_ray_ray0)
+        apparent = self._apparent(matches, H_ray_ray0, predicted)
         return TargetMatch(np.stack([match.edges_raw for match in matches]), apparent)
 
-    def _apparent(self, matches: list[LineMatch], H_ray_ray0: Floats) -> Apparent | None:
+    def _apparent(self, matches: list[LineMatch], H_ray_ray0: Floats, predicted: Apparent) -> Apparent | None:
         usable = [match if match.measured >= STATIONS // 4 else NOT_FOUND for match in matches]
         rays = self._lens.rays_from_raw(np.stack([match.midline_raw for match in usable]))
         rays0 = apply_homography(np.linalg.inv(H_ray_ray0), rays)
-        fit = rigid_from_lines(rays0[None], np.ones((1, *rays0.shape[:2])), self._lines)
-        return _apparent_of(fit)
+        return _apparent_of(rough_rigid_from_lines(rays0, self._lines, predicted.shift, predicted.rotation_rad))
 
     def _mapping(self, H_ray_ray0: Floats, apparent: Apparent) -> Callable[[Floats], Floats]:
         def to_raw(rays0: Floats) -> Floats:

@@ -17,6 +17,7 @@ TUKEY = 4.685
 ITERATIONS = 8
 # Plain Gauss-Newton doubles the right digits each time; rotations are fractions of a degree.
 PLAIN_ITERATIONS = 4
+ROUGH_ITERATIONS = 2
 
 
 @dataclass(frozen=True)
@@ -222,6 +223,32 @@ def rigid_from_lines(
         shift, angle = shift + step[:, :2], angle + step[:, 2]
     residual, _ = _line_residual(x, shift, angle, lines.normal, target)
     return RigidFit(shift, angle, np.where(seen, residual, np.nan), used, normal, sigma)
+
+
+def rough_rigid_from_lines(points: Floats, lines: LineSet, shift: Floats, rotation_rad: float) -> RigidFit:
+    """Return the rigid motion of one frame from the medians of each line's halves: quick, and good enough to follow.
+
+    Args:
+        points: (L, K, 2) mid-line points, nan where not measured; K is even.
+        shift, rotation_rad: predicted, where the search starts.
+
+    Returns:
+        The motion with F = 1; its normal matrix is singular where the lines do not fix it.
+    """
+    count, stations, _ = points.shape
+    seen = finite_rows(points)[None]
+    x = np.where(seen[..., None], points - lines.centre, 0.0)
+    target = np.broadcast_to(lines.offset[:, None], (count, stations))
+    weight = seen.reshape(1, 2 * count, -1).sum(axis=-1).astype(np.float64)
+    move, angle = shift[None].copy(), np.array([rotation_rad])
+    residual, normal = np.zeros(seen.shape), np.zeros((1, 3, 3))
+    for _ in range(ROUGH_ITERATIONS):
+        residual, J = _line_residual(x, move, angle, lines.normal, target)
+        middle = finite_median(np.where(seen, residual, np.nan).reshape(1, 2 * count, -1))
+        J_half = np.where(seen[..., None], J, 0.0).reshape(1, 2 * count, -1, 3).sum(axis=2)
+        normal, step = _gauss_newton(J_half / np.maximum(weight, 1.0)[..., None], middle, weight)
+        move, angle = move + step[:, :2], angle + step[:, 2]
+    return RigidFit(move, angle, np.where(seen, residual, np.nan), seen.astype(np.float64), normal, np.ones((1, count)))
 
 
 def _line_residual(x: Floats, shift: Floats, angle: Floats, normal: Floats, target: Floats) -> tuple[Floats, Floats]:

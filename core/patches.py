@@ -25,8 +25,9 @@ Singles = NDArray[np.float32]
 HALF_PX = 10  # patches of 21 x 21 pixels: 400 of them are 0.18 megapixel
 MARGIN_PX = 6  # room for deformation and for the interpolation kernel
 OVERSAMPLING = 2  # linear interpolation between half pixels errs below the noise of 8-bit video
-MAX_ITERATIONS = 12
-CONVERGED_PX = 0.001  # each step leaves about a tenth of its own length
+# Each step leaves about a tenth of its own length; a patch that takes more than a few shows something else.
+MAX_ITERATIONS = 4
+SETTLED_PX = 0.02
 # A patch that wanders further than this from its prediction has lost its own minimum.
 MAX_WANDER_PX = 5.0
 
@@ -88,32 +89,42 @@ class PatchTracker:
     def _align(
         self, index: NDArray[np.int64], pixels: Singles, predicted_raw: Floats, ref_from_current: Floats
     ) -> tuple[Floats, Floats]:
+        """Return positions (n, 2) by Gauss-Newton steps and the correlation (n,) before the last step."""
         centre = np.rint(predicted_raw)
         position = predicted_raw.copy()
-        # Rows of each patch's basis: the frame's pixels, one, then the reference and its gradients, anew each time.
-        basis = np.empty((len(index), 5, pixels[0].size), dtype=np.float32)
-        basis[:, 0] = pixels.reshape(len(index), -1)
-        basis[:, 1] = 1.0
         score = np.zeros(len(index))
         active = np.arange(len(index))
+        frame = pixels.reshape(len(index), -1)
+        frame -= frame.mean(axis=1, keepdims=True)
+        energy = np.vecdot(frame, frame).astype(np.float64)
         for _ in range(MAX_ITERATIONS):
-            template = self._template(index[active], (centre - position)[active], ref_from_current[active])
-            step, score[active] = _step(basis, template)
-            position[active] += step
-            moving = (np.abs(step).max(axis=1) > CONVERGED_PX) & (
+            offset, offset_ref = self._snapped(index[active], (centre - position)[active], ref_from_current[active])
+            template = self._template(index[active], offset_ref, ref_from_current[active])
+            step, score[active] = _step(frame, energy, template)
+            position[active] = centre[active] - offset + step
+            moving = (np.abs(step).max(axis=1) > SETTLED_PX) & (
                 np.abs(position - predicted_raw)[active].max(axis=1) < 2 * MAX_WANDER_PX
             )
             active = active[moving]
             if not len(active):
                 break
-            basis = basis[moving]
+            frame, energy = frame[moving], energy[moving]
         return position, score
 
-    def _template(self, index: NDArray[np.int64], offset: Floats, ref_from_current: Floats) -> Singles:
-        """Return the reference as the frame should show it, (n, size + 2, size + 2), around the frame's pixels."""
-        # A frame pixel at centre + x shows the reference at point + A (centre + x - position).
-        start = np.einsum("nij,nj->ni", ref_from_current, offset) + self.points_raw[index] - self._anchor[index]
-        coefficients = np.concatenate([ref_from_current, start[..., None]], axis=2)
+    def _snapped(self, index: NDArray[np.int64], offset: Floats, ref_from_current: Floats) -> tuple[Floats, Floats]:
+        """Return frame offsets (n, 2) moved onto places the interpolation can reach exactly, and those places.
+
+        `cv2.remap` knows 32 places between two samples. What it would round away is left to the step instead.
+        """
+        grid = 32 * OVERSAMPLING
+        place = np.einsum("nij,nj->ni", ref_from_current, offset) + self.points_raw[index] - self._anchor[index]
+        place = np.rint(place * grid) / grid
+        within = place - self.points_raw[index] + self._anchor[index]
+        return np.linalg.solve(ref_from_current, within[..., None])[..., 0], place
+
+    def _template(self, index: NDArray[np.int64], place: Floats, ref_from_current: Floats) -> Singles:
+        """Return the reference as the frame should show it, (n, size + 2, size + 2), around `place` (n, 2) of it."""
+        coefficients = np.concatenate([ref_from_current, place[..., None]], axis=2)
         coefficients *= OVERSAMPLING
         coefficients[..., 2] += self._tile_origin[index]
         maps = coefficients.astype(np.float32) @ self._grid
@@ -147,34 +158,39 @@ def _cut_out(luma: Luma, corner: NDArray[np.int64], size: int) -> Singles:
     return patches
 
 
-def _step(basis: Singles, template: Singles) -> tuple[Floats, Floats]:
+def _step(frame: Singles, energy: Floats, template: Singles) -> tuple[Floats, Floats]:
     """Return one Gauss-Newton step (n, 2) in pixels and the correlation (n,) before it.
 
     Args:
-        basis: (n, 5, pixels): the frame's pixels and one; the other three rows are filled in here.
+        frame: (n, pixels) the frame's pixels, each patch with zero mean.
+        energy: (n,) their squared norms.
         template: (n, size + 2, size + 2) the reference around the same pixels.
     """
-    n, _, size = template.shape
-    inner = size - 2
-    square = basis.reshape(n, 5, inner, inner)
-    square[:, 2] = template[:, 1:-1, 1:-1]
-    np.subtract(template[:, 1:-1, 2:], template[:, 1:-1, :-2], out=square[:, 3])
-    np.subtract(template[:, 2:, 1:-1], template[:, :-2, 1:-1], out=square[:, 4])
-    # One small Gram matrix per patch holds every product that is needed.
-    gram = (basis @ basis.transpose(0, 2, 1)).astype(np.float64)
-    gram[:, :, 3:] *= 0.5
-    gram[:, 3:, :] *= 0.5
-    # An offset of the light is taken out of all of them first, then its gain out of the gradients.
-    gram = gram - gram[:, :, 1:2] * gram[:, 1:2, :] / gram[:, 1:2, 1:2]
-    energy, power, moment = np.maximum(gram[:, 0, 0], 1e-9), np.maximum(gram[:, 2, 2], 1e-9), gram[:, 0, 2]
+    n = len(frame)
+    inner = np.ascontiguousarray(template[:, 1:-1, 1:-1]).reshape(n, -1)
+    inner -= inner.mean(axis=1, keepdims=True)
+    gradient_u = (template[:, 1:-1, 2:] - template[:, 1:-1, :-2]).reshape(n, -1)
+    gradient_v = (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]).reshape(n, -1)
+    power, moment = _products(inner, inner), _products(inner, frame)
+    energy, power = np.maximum(energy, 1e-9), np.maximum(power, 1e-9)
     score, gain = moment / np.sqrt(power * energy), moment / power
-    across = gram[:, 2, 3:] / power[:, None]
-    H = gram[:, 3:, 3:] - across[:, :, None] * gram[:, 2, None, 3:]
-    b = gram[:, 0, 3:] - across * moment[:, None]
-    determinant = H[:, 0, 0] * H[:, 1, 1] - H[:, 0, 1] ** 2
-    usable = (determinant > 1e-6 * (H[:, 0, 0] + H[:, 1, 1]) ** 2) & (gain > 0.1)
+    # An offset of the light is taken out of the gradients first (the others have zero mean), then its gain.
+    mean_u, mean_v = gradient_u.sum(axis=1, dtype=np.float64), gradient_v.sum(axis=1, dtype=np.float64)
+    across_u, across_v = _products(gradient_u, inner), _products(gradient_v, inner)
+    count = inner.shape[1]
+    H_uu = 0.25 * (_products(gradient_u, gradient_u) - mean_u**2 / count - across_u**2 / power)
+    H_uv = 0.25 * (_products(gradient_u, gradient_v) - mean_u * mean_v / count - across_u * across_v / power)
+    H_vv = 0.25 * (_products(gradient_v, gradient_v) - mean_v**2 / count - across_v**2 / power)
+    b_u = 0.5 * (_products(gradient_u, frame) - across_u * gain)
+    b_v = 0.5 * (_products(gradient_v, frame) - across_v * gain)
+    determinant = H_uu * H_vv - H_uv**2
+    usable = (determinant > 1e-6 * (H_uu + H_vv) ** 2) & (gain > 0.1)
     safe = np.where(usable, determinant * gain, 1.0)
-    du = (H[:, 1, 1] * b[:, 0] - H[:, 0, 1] * b[:, 1]) / safe
-    dv = (H[:, 0, 0] * b[:, 1] - H[:, 0, 1] * b[:, 0]) / safe
+    du = (H_vv * b_u - H_uv * b_v) / safe
+    dv = (H_uu * b_v - H_uv * b_u) / safe
     step = np.where(usable[:, None], np.clip(-np.stack([du, dv], axis=1), -2.0, 2.0), 0.0)
     return step, np.where(usable, score, 0.0)
+
+
+def _products(left: Singles, right: Singles) -> Floats:
+    return np.asarray(np.vecdot(left, right), dtype=np.float64)

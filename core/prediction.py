@@ -19,7 +19,7 @@ from core.measurements import FrameMeasurement, Reference
 from core.project import Method, Target
 
 # Raised whenever the same video would be measured differently: older recordings are then not continued.
-MEASURE_VERSION = 1
+MEASURE_VERSION = 2
 # Bytes read at each of a video's places to tell it from another.
 SAMPLE_BYTES = 1 << 20
 

@@ -28,7 +28,9 @@ STATIONS = 64
 LEAST_EDGE = 1.5
 # Correlation of the cross profile below which something else lies in the band.
 LEAST_CORRELATION = 0.5
-NEWTON_STEPS = 4
+HALLEY_STEPS = 3
+# Parts of a band whose cross profiles are compared one by one, so that one hidden part does not decide.
+QUARTERS = 4
 
 
 @dataclass(frozen=True)
@@ -181,41 +183,36 @@ class LineTracker:
         expected = self.profile.offset_px + self.profile.tilt_px * section.x
         fraction = section.across + expected - np.rint(section.across)
         signature = self.profile.signature
-        context = (len(signature) - 1) // 2
-        scores = []
-        for part in np.array_split(np.arange(len(section.along)), 4):
-            base = int(np.rint(fraction[part].mean()))
-            window = section.values[part].mean(axis=0)
-            first = section.half + base - search - context
-            last = section.half + base + search + context + 1
-            if first < 0 or last > len(window):
-                padded = np.pad(window, len(window), mode="edge")
-                first, last, window = first + len(window), last + len(window), padded
-            scores.append(_correlations(window[first:last], signature))
-        score = np.median(np.stack(scores), axis=0)
+        reach = search + (len(signature) - 1) // 2
+        windows = np.empty((QUARTERS, 2 * reach + 1))
+        for window, part in zip(windows, np.array_split(np.arange(len(section.along)), QUARTERS), strict=True):
+            columns = section.half + round(float(fraction[part].mean())) + np.arange(-reach, reach + 1)
+            mean = section.values[part[0] : part[-1] + 1].mean(axis=0)
+            window[:] = mean[np.clip(columns, 0, len(mean) - 1)]
+        score = np.median(_correlations(windows, signature), axis=0)
         shifts = np.arange(-search, search + 1)
         # Among equals the nearest wins; a look-alike must be clearly better to be preferred.
         best = int(np.argmax(score - 0.1 * (shifts / max(search, 1)) ** 2))
         return float(shifts[best]), float(score[best])
 
     def _edges(self, section: _Section, offset: float) -> Floats:
-        """Return both edges (STATIONS, 2, 2) by Newton's method on the response to a derivative of a Gaussian."""
-        bin_of = np.minimum((section.place * STATIONS).astype(np.int64), STATIONS - 1)
+        """Return both edges (STATIONS, 2, 2) where the response to a derivative of a Gaussian is extreme."""
+        station = np.minimum((section.place * STATIONS).astype(np.int64), STATIONS - 1)
+        members = (station == np.arange(STATIONS)[:, None]).astype(np.float32)
         line = section.across + self.profile.offset_px + self.profile.tilt_px * section.x + offset
-        count = np.bincount(bin_of, minlength=STATIONS).astype(np.float64)
+        count = np.bincount(station, minlength=STATIONS).astype(np.float64)
         filled = np.maximum(count, 1.0)
-        along = np.bincount(bin_of, section.along, STATIONS) / filled
-        middle = np.bincount(bin_of, line, STATIONS) / filled
+        along = np.bincount(station, section.along, STATIONS) / filled
+        middle = np.bincount(station, line, STATIONS) / filled
         wanted = 0.5 * np.median(count[count > 0])
+        side = np.array([[-1.0], [1.0]])
+        edge = line + side * self.profile.width_px / 2
+        slope_sign = -side * self.profile.polarity
+        shift, strength = _extremes(section, edge, station, members, slope_sign, self._scale_px())
+        good = (count >= wanted) & (np.abs(shift) < self._capture_px()) & (strength > 0.25 * self.profile.edge)
         found = np.full((STATIONS, 2, 2), np.nan)
-        for side, sign in enumerate((-1.0, 1.0)):
-            edge = line + sign * self.profile.width_px / 2
-            slope_sign = -sign * self.profile.polarity
-            shift, strength = _newton(section, edge, bin_of, slope_sign, self._scale_px())
-            good = (count >= wanted) & (np.abs(shift) < self._capture_px()) & (strength > 0.25 * self.profile.edge)
-            position = middle + sign * self.profile.width_px / 2 + shift
-            found[good, side, section.axis] = along[good]
-            found[good, side, 1 - section.axis] = position[good]
+        found[..., section.axis] = np.where(good, along, np.nan).T
+        found[..., 1 - section.axis] = np.where(good, middle + side * self.profile.width_px / 2 + shift, np.nan).T
         width = found[:, 1, 1 - section.axis] - found[:, 0, 1 - section.axis]
         wrong = ~(np.abs(width - self.profile.width_px) < 0.3 * self.profile.width_px + 0.7)
         found[wrong] = np.nan
@@ -239,44 +236,67 @@ def _profiles(luma: Luma, along: Floats, middle: NDArray[np.int64], half: int, a
     return block.ravel().take(start[:, None] + np.arange(2 * half + 1)).astype(np.float32)
 
 
-def _correlations(window: Singles, signature: Singles) -> Floats:
-    """Return the normalised correlation of a signature (m,) at every shift in a window (m + shifts - 1,)."""
-    pieces = np.lib.stride_tricks.sliding_window_view(window, len(signature)).astype(np.float64)
-    pieces = pieces - pieces.mean(axis=1, keepdims=True)
-    norm = np.sqrt((pieces**2).sum(axis=1))
+def _correlations(windows: Floats, signature: Singles) -> Floats:
+    """Return the normalised correlation of a signature (m,) at every shift in windows (n, m + shifts - 1)."""
+    pieces = np.lib.stride_tricks.sliding_window_view(windows, len(signature), axis=1)
+    variation = (pieces**2).sum(axis=-1) - pieces.sum(axis=-1) ** 2 / len(signature)
+    norm = np.sqrt(np.maximum(variation, 0.0))
     return np.asarray((pieces @ signature) / np.maximum(norm, 1e-6 + 0.5 * np.sqrt(len(signature))))
 
 
-def _newton(
-    section: _Section, edge: Floats, bin_of: NDArray[np.int64], slope_sign: float, scale_px: float
+def _extremes(
+    section: _Section,
+    edge: Floats,
+    station: NDArray[np.int64],
+    members: Singles,
+    slope_sign: Floats,
+    scale_px: float,
 ) -> tuple[Floats, Floats]:
-    """Return, per station, how far the true edge lies from `edge` (n,) and its strength in grey levels per pixel.
+    """Return, per edge and station (2, STATIONS), how far the edge lies from `edge` and its grey levels per pixel.
 
     All columns of a station share one shift; it makes their summed response to a derivative of a Gaussian extreme.
+    Found by Halley's method, which triples the correct digits with each step.
+
+    Args:
+        edge: (2, n) expected place of both edges in each column.
+        station: (n,) of each column.
+        members: (STATIONS, n) one where a column belongs to a station.
+        slope_sign: (2, 1) of each edge's slope.
     """
     half = int(np.ceil(3.0 * scale_px)) + 1
     taps = np.arange(-half, half + 1)
-    shift = np.zeros(STATIONS)
-    strength = np.zeros(STATIONS)
-    origin = np.rint(section.across) - section.half
-    rows = np.arange(len(edge))[:, None]
+    rows = np.arange(len(section.across))[:, None]
     last = section.values.shape[1] - 1
-    for _ in range(NEWTON_STEPS):
-        position = edge + shift[bin_of] - origin
+    expected = edge - (np.rint(section.across) - section.half)
+    shift = np.zeros((2, STATIONS))
+    for _ in range(HALLEY_STEPS):
+        position = expected + shift[:, station]
         nearest = np.rint(position)
-        index = np.clip(nearest[:, None].astype(np.int64) + taps, 0, last)
+        index = np.clip(nearest[..., None].astype(np.int64) + taps, 0, last)
         sample = section.values[rows, index]
-        s = (nearest - position)[:, None] + taps
-        gauss = np.exp(-0.5 * (s / scale_px) ** 2)
-        # Derivatives of the response sum f(s) s exp(-s^2 / 2 sigma^2) by the position of the kernel.
-        q = (s / scale_px) ** 2
-        first = np.bincount(bin_of, ((q - 1.0) * gauss * sample).sum(axis=1), STATIONS)
-        second = np.bincount(bin_of, ((q - 3.0) * s / scale_px**2 * gauss * sample).sum(axis=1), STATIONS)
-        response = np.bincount(bin_of, (s * gauss * sample).sum(axis=1), STATIONS)
-        power = np.bincount(bin_of, (s * s * gauss).sum(axis=1), STATIONS)
+        s = ((nearest - position)[..., None] + taps).astype(np.float32)
+        q = (s / np.float32(scale_px)) ** 2
+        gauss = np.exp(-0.5 * q)
+        # Derivatives of the response, the sum of f(s) s exp(-s^2 / 2 sigma^2), by the position of the kernel.
+        weighted = gauss * sample
+        by_column = np.stack(
+            [
+                np.vecdot(s, weighted),
+                np.vecdot(q - 1.0, weighted),
+                np.vecdot((q - 3.0) * s, weighted) / scale_px**2,
+                np.vecdot((q - 6.0) * q + 3.0, weighted) / scale_px**2,
+                np.vecdot(s * s, gauss),
+            ],
+            axis=-1,
+        ).astype(np.float32)
+        response, first, second, third, power = np.moveaxis((members @ by_column).astype(np.float64), -1, 0)
         strength = slope_sign * response / np.maximum(power, 1e-9)
         curved = second * slope_sign < 0
-        step = np.where(curved, -first / np.where(curved, second, 1.0), 0.0)
+        denominator = 2.0 * second**2 - first * third
+        usable = curved & (denominator > 0.5 * second**2)
+        halley = -2.0 * first * second / np.where(usable, denominator, 1.0)
+        newton = -first / np.where(curved, second, 1.0)
+        step = np.where(usable, halley, np.where(curved, newton, 0.0))
         shift += np.clip(step, -1.0, 1.0)
     return shift, np.where(curved & (np.abs(step) < 0.05), strength, 0.0)
 

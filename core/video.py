@@ -6,6 +6,7 @@ order from 0; times are seconds since the first presented frame. Edit lists and 
 
 from __future__ import annotations
 
+import os
 import queue
 import threading
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ from core.errors import InputError
 Luma = NDArray[np.uint8]
 # Frames decoded ahead of the one being measured: enough to keep the decoder busy, 12 MB each at 4K.
 READ_AHEAD = 6
+MOST_THREADS = 16
 EIGHT_BIT_LUMA = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 
 
@@ -243,7 +245,8 @@ def _pictures(path: Path, start: int, stop: int | None, threads: int) -> Iterato
     """Yield decoded pictures with their frame numbers; numbers after a seek come from the timestamps alone."""
     with _opened(path) as (container, stream):
         stream.codec_context.thread_type = "AUTO"
-        stream.codec_context.thread_count = threads
+        # Left to itself, FFmpeg takes one thread more than there are cores, which then get in each other's way.
+        stream.codec_context.thread_count = threads or min(MOST_THREADS, available_cores())
         position = _seek(container, stream, path, start) if start > 0 else None
         number = 0
         for picture in _until_damaged(container, stream):
@@ -277,6 +280,11 @@ def _seek(container: InputContainer, stream: VideoStream, path: Path, start: int
     if keys:
         container.seek(keys[-1], stream=stream, backward=True)
     return {tick: number for number, tick in enumerate(index.ticks)}
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def luma_of(picture: VideoFrame) -> Luma:
