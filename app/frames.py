@@ -1,38 +1,38 @@
 """Pictures of single frames, quick enough to step and scrub through: decoded once, kept for a while.
 
-A reader stays open where it last was, so that the next frame costs one decoding step. Going back decodes a short
-stretch before the frame asked for, so that the following steps back cost nothing.
+Whoever looks at a frame looks next at the one after it, or before it: both are decoded before they are asked for.
 """
 
 from __future__ import annotations
 
-import bisect
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
 import cv2
 import numpy as np
+from av.video.frame import VideoFrame
+from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
+from app.seeking import SeekingReader
 from core.errors import InputError
 from core.lens import Lens
-from core.video import FrameIndex, frame_index, read_frames_rgb
 
 Picture = NDArray[np.uint8]
 Fingerprint = tuple[str, int, int]
 
 JPEG_QUALITY = 90
-_FRAME_BYTES = 320 << 20
+# As decoded, a frame of 4K takes 12 MB: enough for a group of pictures and those fetched before and after.
+_DECODED_BYTES = 448 << 20
+_PICTURE_BYTES = 80 << 20
 _JPEG_BYTES = 96 << 20
-# Reading on this many frames is quicker than opening the file anew and decoding from a key frame.
-_READ_ON = 40
-_OPEN_READERS = 3
+_OPEN_VIDEOS = 3
 _AHEAD = 3
+_BEHIND = 6
 
 
 class ByteCache:
@@ -66,11 +66,13 @@ class FrameStore:
     """Frames of all videos that are being looked at."""
 
     def __init__(self) -> None:
-        self._frames = ByteCache(_FRAME_BYTES, lambda frame: int(frame.nbytes))
+        self._decoded = ByteCache(_DECODED_BYTES, _size_of)
+        self._pictures = ByteCache(_PICTURE_BYTES, lambda picture: int(picture.nbytes))
         self._jpegs = ByteCache(_JPEG_BYTES, len)
-        self._readers: OrderedDict[Fingerprint, _Reader] = OrderedDict()
+        self._videos: OrderedDict[Fingerprint, _Video] = OrderedDict()
         self._lock = threading.Lock()
         self._ahead = ThreadPoolExecutor(1, thread_name_prefix="frames ahead")
+        self._wanted: tuple[Fingerprint, int] | None = None
         self._undistorting: tuple[Any, tuple[Picture, Picture]] | None = None
 
     def frame(self, video: Path, number: int) -> Picture:
@@ -79,7 +81,12 @@ class FrameStore:
         Raises:
             InputError: there is no such video or no such frame.
         """
-        return self._reader(video).frame(number)
+        key = (fingerprint(video), number)
+        found = self._pictures.get(key)
+        if found is None:
+            found = _upright(self._video(video).onwards.frame(number))
+            self._pictures.put(key, found)
+        return cast(Picture, found)
 
     def jpeg(self, video: Path, number: int, *, width: int | None = None, lens: Lens | None = None) -> bytes:
         """Return a frame as JPEG, undistorted where a lens is given, scaled down to `width` where that is smaller.
@@ -95,33 +102,41 @@ class FrameStore:
                 frame = self._undistorted(frame, lens)
             found = jpeg_of(scaled_to(frame, width))
             self._jpegs.put(key, found)
-        self._ahead.submit(self._read_ahead, video, number)
+        self._wanted = (fingerprint(video), number)
+        self._ahead.submit(self._prepare, video, number)
         return cast(bytes, found)
 
     def close(self) -> None:
         """Let go of all files."""
+        self._wanted = None
         self._ahead.shutdown(wait=True, cancel_futures=True)
         with self._lock:
-            readers = list(self._readers.values())
-            self._readers.clear()
-        for reader in readers:
-            reader.close()
+            videos = list(self._videos.values())
+            self._videos.clear()
+        for video in videos:
+            video.close()
 
-    def _reader(self, video: Path) -> _Reader:
-        key = fingerprint(video)
+    def _video(self, file: Path) -> _Video:
+        key = fingerprint(file)
         with self._lock:
-            reader = self._readers.pop(key, None) or _Reader(video, key, self._frames)
-            self._readers[key] = reader
-            idle = [self._readers.popitem(last=False)[1] for _ in range(len(self._readers) - _OPEN_READERS)]
+            video = self._videos.pop(key, None) or _Video(file, key, self._decoded)
+            self._videos[key] = video
+            idle = [self._videos.popitem(last=False)[1] for _ in range(len(self._videos) - _OPEN_VIDEOS)]
         for forgotten in idle:
             forgotten.close()
-        return reader
+        return video
 
-    def _read_ahead(self, video: Path, number: int) -> None:
-        reader = self._reader(video)
-        for following in range(number + 1, min(number + 1 + _AHEAD, reader.count)):
-            if reader.is_next(following):
-                reader.frame(following)
+    def _prepare(self, file: Path, number: int) -> None:
+        """Decode what is likely to be asked for next; stops when something else is."""
+        video = self._video(file)
+        for following in range(number + 1, min(number + 1 + _AHEAD, len(video.onwards.index))):
+            if self._wanted == (video.key, number) and video.onwards.is_next(following):
+                video.onwards.frame(following)
+        missing = [before for before in range(max(0, number - _BEHIND), number) if not video.has(before)]
+        for before in missing:
+            if self._wanted != (video.key, number):
+                return
+            video.backwards.frame(before)
 
     def _undistorted(self, frame: Picture, lens: Lens) -> Picture:
         key = _lens_key(lens)
@@ -133,91 +148,38 @@ class FrameStore:
         return cast(Picture, cv2.remap(frame, *maps[1], cv2.INTER_LINEAR))
 
 
-class _Reader:
-    """One video, open where it was read last."""
+class _Video:
+    """A video opened twice: where a person looks, and where the frames before are fetched from meanwhile."""
 
-    def __init__(self, video: Path, key: Fingerprint, frames: ByteCache) -> None:
-        self._video, self._key, self._frames = video, key, frames
-        self._stream: Generator[tuple[int, Picture], None, None] | None = None
-        self._next = 0
-        self._lock = threading.Lock()
+    def __init__(self, file: Path, key: Fingerprint, decoded: ByteCache) -> None:
+        self.key, self._decoded = key, decoded
+        self.onwards, self.backwards = (SeekingReader(file, self._kept, self._keep) for _ in range(2))
 
-    @cached_property
-    def _index(self) -> FrameIndex:
-        return frame_index(self._video)
-
-    @property
-    def count(self) -> int:
-        return len(self._index)
-
-    @cached_property
-    def _key_frames(self) -> list[int]:
-        return [bisect.bisect_left(self._index.ticks, tick) for tick in self._index.key_ticks]
-
-    def frame(self, number: int) -> Picture:
-        # The first picture of a video that was just added is there at once: only others need to know where they lie.
-        if number != 0 and not 0 <= number < self.count:
-            raise InputError(
-                f"{self._video.name}: has frames 0 to {self.count - 1}, so there is no frame {number}; choose another."
-            )
-        found = self._frames.get((self._key, number))
-        if found is not None:
-            return cast(Picture, found)
-        with self._lock:
-            found = self._frames.get((self._key, number))
-            return cast(Picture, found) if found is not None else self._read(number)
-
-    def is_next(self, number: int) -> bool:
-        return self._stream is not None and self._next == number
+    def has(self, number: int) -> bool:
+        """Whether a frame is decoded."""
+        return self._kept(number) is not None
 
     def close(self) -> None:
-        with self._lock:
-            self._close()
+        self.onwards.close()
+        self.backwards.close()
 
-    def _read(self, number: int) -> Picture:
-        if self._stream is None or not self._may_read_on(number):
-            self._open(self._start_for(number))
-        assert self._stream is not None
-        for index, picture in self._stream:
-            self._next = index + 1
-            picture.flags.writeable = False
-            self._frames.put((self._key, index), picture)
-            if index >= number:
-                return picture
-        self._close()
-        raise InputError(f"{self._video.name}: frame {number} cannot be decoded; export the video again.")
+    def _kept(self, number: int) -> VideoFrame | None:
+        return cast("VideoFrame | None", self._decoded.get((self.key, number)))
 
-    def _may_read_on(self, number: int) -> bool:
-        if number == self._next:
-            return True
-        gap = number - self._next
-        key_frame = self._key_frame_before(number)
-        return gap >= 0 and (gap <= _READ_ON or key_frame <= self._next) and not key_frame > self._next + 8
+    def _keep(self, number: int, frame: VideoFrame) -> None:
+        self._decoded.put((self.key, number), frame)
 
-    def _start_for(self, number: int) -> int:
-        """Where to begin so that steps back from here are quick: a few frames earlier, if they were just asked for."""
-        if number == 0:
-            return 0
-        stepping_back = self._stream is not None and number < self._next <= number + _READ_ON
-        if not stepping_back:
-            return number
-        sample = self._frames.get((self._key, number + 1))
-        stretch = _FRAME_BYTES // (3 * sample.nbytes) if sample is not None else 1
-        return max(0, number - min(stretch, _READ_ON), self._key_frame_before(number))
 
-    def _key_frame_before(self, number: int) -> int:
-        place = bisect.bisect_right(self._key_frames, number)
-        return self._key_frames[place - 1] if place else 0
+def _size_of(frame: VideoFrame) -> int:
+    return sum(plane.buffer_size for plane in frame.planes)
 
-    def _open(self, start: int) -> None:
-        self._close()
-        self._stream = cast(Generator[tuple[int, Picture], None, None], read_frames_rgb(self._video, start))
-        self._next = start
 
-    def _close(self) -> None:
-        if self._stream is not None:
-            self._stream.close()
-            self._stream = None
+def _upright(frame: VideoFrame) -> Picture:
+    """Return (height, width, 3) RGB; with a converter of its own, since two threads may ask for one frame."""
+    rgb = VideoReformatter().reformat(frame, format="rgb24").to_ndarray()
+    picture = np.ascontiguousarray(np.rot90(rgb, frame.rotation // 90))
+    picture.flags.writeable = False
+    return cast(Picture, picture)
 
 
 def fingerprint(file: Path) -> Fingerprint:
