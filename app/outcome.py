@@ -20,6 +20,7 @@ from app.errors import ApiError, NotYet
 from app.frames import Fingerprint, fingerprint
 from app.jobs import JOB_FILE
 from app.store import ProjectFolder, read_json, stored_inputs
+from app.videos import video_info
 from core.errors import InputError
 from core.export import SUMMARY_FILE, GpsCheck, Results, compared_with_gps
 from core.lens import Lens
@@ -89,7 +90,7 @@ def state_of(folder: ProjectFolder, project: Project) -> Outcome:
         ready=ready,
         stale=ready and _is_stale(folder, project, summary),
         frames_done=recorded.frames,
-        frames_total=_frames_total(folder, project),
+        frames_total=_frames_total(folder, project, recorded.frames > 0),
         finished=recorded.finished,
         failure=_failure(folder),
         counts=counts,
@@ -119,9 +120,11 @@ def _is_stale(folder: ProjectFolder, project: Project, summary: dict[str, Any]) 
     return False
 
 
-def _frames_total(folder: ProjectFolder, project: Project) -> int:
+def _frames_total(folder: ProjectFolder, project: Project, exactly: bool) -> int:
+    """Return how many frames the video has; what the container says suffices before any is measured."""
     try:
-        return len(frame_index(folder.require_input("video", project)))
+        video = folder.require_input("video", project)
+        return len(frame_index(video)) if exactly else video_info(video).frames or 0
     except (InputError, ApiError):
         return 0
 

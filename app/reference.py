@@ -14,30 +14,16 @@ import numpy as np
 from app.context import Context
 from app.frames import Fingerprint, fingerprint
 from app.store import ProjectFolder
+from app.videos import video_info
 from core.coordinates import Floats, OrthoGrid
 from core.errors import InputError
 from core.georeference import ReferenceFit, fit_reference
 from core.lens import Lens, read_lens, require_image_size
 from core.project import Correspondence, Project
-from core.video import VideoInfo, probe
 
 _KEPT = 64
 _fits: OrderedDict[Any, ReferenceFit | InputError] = OrderedDict()
 _lock = threading.Lock()
-
-
-def video_info(path: Path) -> VideoInfo:
-    """Return what the video's container says, kept while the file stays.
-
-    Raises:
-        InputError: it cannot be used.
-    """
-    return _probed(fingerprint(path))
-
-
-@lru_cache(maxsize=32)
-def _probed(key: Fingerprint) -> VideoInfo:
-    return probe(Path(key[0]))
 
 
 def lens_of(folder: ProjectFolder, project: Project) -> tuple[Lens, bool]:

@@ -12,6 +12,7 @@ from app import orthoimages, outcome
 from app.errors import ApiError
 from app.reference import reference_fit
 from app.store import ProjectFolder, problem_of, stored_inputs
+from app.videos import is_read_through
 from core.check import check_project
 from core.errors import InputError
 from core.project import Project, project_json
@@ -72,7 +73,17 @@ def steps_of(here: Context, folder: ProjectFolder, project: Project, *, look: bo
         "drift": _drift,
         "export": _export,
     }
-    return Facts({name: check(seen) for name, check in checks.items()}, _problems(folder, project, look))
+    problems = _problems(folder, project, look and _is_read_through(seen))
+    return Facts({name: check(seen) for name, check in checks.items()}, problems)
+
+
+def _is_read_through(seen: _Look) -> bool:
+    """Whether looking for problems takes no longer than a page may; a large video is read through meanwhile."""
+    try:
+        video = seen.folder.require_input("video", seen.project)
+        return is_read_through(seen.here.hub, seen.folder, video)
+    except (InputError, ApiError):
+        return True
 
 
 def steps_of_broken(message: str) -> dict[str, Step]:

@@ -19,11 +19,12 @@ from app.jobs import Finish
 from app.places import SUFFIXES_OF_CLOUD_TABLES, kind_of
 from app.store import CHECKERBOARD_FOLDER, INPUT_KINDS, ProjectFolder, problem_of, read_json, stored_inputs
 from app.uploads import receive_file
+from app.videos import is_read_through, video_info
 from core.errors import InputError
 from core.lens import read_lens, require_image_size
 from core.project import Project
 from core.validation import read_gps
-from core.video import frame_index, probe
+from core.video import frame_index
 
 router = APIRouter(prefix="/api")
 
@@ -117,17 +118,18 @@ def _understood(here: Context, folder: ProjectFolder, project: Project, kind: st
 
 
 def _video(here: Context, folder: ProjectFolder, project: Project, path: Path) -> dict[str, Any]:
-    info, index = probe(path), frame_index(path)
+    info = video_info(path)
+    facts = {"width": info.width, "height": info.height, "codec": info.codec, "rotation_deg": info.rotation_deg}
+    if not is_read_through(here.hub, folder, path):
+        told = {"rate_hz": info.rate_hz, "frames": info.frames, "duration_s": info.duration_s}
+        return facts | told | {"variable_rate": None}
+    index = frame_index(path)
     steps_s = index.time_s[1:] - index.time_s[:-1]
     varies = len(steps_s) > 0 and bool(abs(steps_s - steps_s.mean()).max() > 0.1 * steps_s.mean())
-    return {
-        "width": info.width,
-        "height": info.height,
+    return facts | {
         "rate_hz": 1.0 / float(steps_s.mean()) if len(steps_s) else info.rate_hz,
         "frames": len(index),
         "duration_s": float(index.time_s[-1]),
-        "codec": info.codec,
-        "rotation_deg": info.rotation_deg,
         "variable_rate": varies,
     }
 
@@ -140,7 +142,7 @@ def _lens(here: Context, folder: ProjectFolder, project: Project, path: Path) ->
     lens = read_lens(path)
     video = folder.input_path("video", project)
     if video is not None and video.is_file():
-        info = probe(video)
+        info = video_info(video)
         require_image_size(lens, width=info.width, height=info.height, lens_file=path.name, video_file=video.name)
     return {
         "image_size_px": list(lens.image_size_px),

@@ -138,6 +138,7 @@ export class FrameView extends Emitter {
     this.#showOverlay();
     this.#setLoupe();
     this.element.dataset.frame = String(frame);
+    this.element.dataset.whole = String(image.isWhole);
     this.emit("shown", { review });
   }
 

@@ -17,7 +17,7 @@ function video(facts) {
       "Frame rate",
       `${fixed(facts.rate_hz, 2)} Hz${facts.variable_rate ? ", variable: each frame's own time is used" : ""}`,
     ],
-    ["Length", `${duration(facts.duration_s)}, ${count(facts.frames)} frames`],
+    ["Length", [duration(facts.duration_s), facts.frames && `${count(facts.frames)} frames`].filter(Boolean).join(", ")],
     ["Codec", facts.codec],
   ];
 }
