@@ -280,7 +280,7 @@ class Outcomes:
 
 def _solve(folder: ProjectFolder, project: Project, method: Method) -> Solved:
     inputs = loaded(folder, project)
-    inputs = replace(inputs, project=project.model_copy(update={"method": method}))
+    inputs = replace(inputs, project=by_method(project, method))
     wanted = _wanted(fingerprint(folder.require_input("video", project)), inputs.project)
     with MeasurementStore(folder.results / FRAMES_FILE) as store:
         number = store.find(method, wanted)
@@ -289,6 +289,14 @@ def _solve(folder: ProjectFolder, project: Project, method: Method) -> Solved:
         recording = store.load(number)
     solution = solve(recording, inputs.project, inputs.lens, inputs.relief, has_lens=inputs.has_lens)
     return Solved(inputs, wanted, recording, solution)
+
+
+def by_method(project: Project, method: Method) -> Project:
+    """Return a project as it would be by another method, with the filter that usually goes with that one."""
+    if method == project.method:
+        return project
+    usual = project.drift.model_copy(update={"filter": "none" if method == "geometric" else "high-pass"})
+    return project.model_copy(update={"method": method, "drift": usual})
 
 
 def loaded(folder: ProjectFolder, project: Project) -> LoadedInputs:

@@ -167,6 +167,7 @@ def filter_warnings(
     intervals: Intervals,
     *,
     corner_hz: float,
+    steady_m: ArrayLike | None = None,
 ) -> list[str]:
     """Return, in words, what a high-pass at this corner does that an engineer would not want.
 
@@ -176,18 +177,24 @@ def filter_warnings(
         time_s: (F,).
         intervals: of the project; each warning needs the intervals it speaks of.
         corner_hz: of the filter.
+        steady_m: (F, 2) displacement that is free of drift without a filter, as the geometric method gives it, where it
+            is known: drift that hides a residual in `unfiltered_m` does not hide it there.
     """
     before, after = np.asarray(unfiltered_m, dtype=np.float64), np.asarray(filtered_m, dtype=np.float64)
     times = np.asarray(time_s, dtype=np.float64)
     return [
-        *_residual_warnings(before, after, times, intervals),
+        *_residual_warnings(before, after, times, intervals, None if steady_m is None else np.asarray(steady_m)),
         *_pre_event_warnings(after, times, intervals, corner_hz),
         *_frequency_warnings(before, times, intervals, corner_hz),
     ]
 
 
-def _residual_warnings(before: Floats, after: Floats, times: Floats, intervals: Intervals) -> list[str]:
+def _residual_warnings(
+    before: Floats, after: Floats, times: Floats, intervals: Intervals, steady: Floats | None
+) -> list[str]:
     """A residual that stands out of the drift, and does not survive."""
+    source = "before it" if steady is None else "by the geometric method"
+    before = before if steady is None else steady
     if intervals.residual is None:
         return []
     chosen = within(times, intervals.residual)
@@ -199,7 +206,7 @@ def _residual_warnings(before: Floats, after: Floats, times: Floats, intervals: 
         was, remains = float(np.nanmean(before[chosen, axis])), float(np.nanmean(after[chosen, axis]))
         if abs(was) > max(0.005, 1.5 * drift[axis]) and abs(remains) < 0.7 * abs(was):
             warnings.append(
-                f"The filter removes the residual displacement along {name}: {100 * was:.1f} cm before it, "
+                f"The filter removes the residual displacement along {name}: {100 * was:.1f} cm {source}, "
                 f"{100 * remains:.1f} cm after it. Use the geometric method without a filter where a residual matters."
             )
     return warnings

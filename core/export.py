@@ -180,17 +180,22 @@ def _drift_warnings(results: Results, target: Target, history: TargetHistory) ->
     drift = results.project.drift
     if drift.filter == "none" or not history.measured.any():
         return []
-    targets = results.solution.targets
-    before = targets[target.name].history
-    if target.relative_to is not None:
-        base = targets[target.relative_to]
-        before = relative_history(before, base.history, rest_m=targets[target.name].rest_m, base_rest_m=base.rest_m)
+    before = unfiltered_history(results.solution, target)
     return [
         f"{target.name}: {sentence}"
         for sentence in filter_warnings(
             before.p1_m, history.p1_m, history.time_s, results.project.intervals_s, corner_hz=drift.corner_hz
         )
     ]
+
+
+def unfiltered_history(solution: Solution, target: Target) -> TargetHistory:
+    """Return a target's displacement before any filter, relative to another target where it is told so."""
+    solved = solution.targets[target.name]
+    if target.relative_to is None:
+        return solved.history
+    base = solution.targets[target.relative_to]
+    return relative_history(solved.history, base.history, rest_m=solved.rest_m, base_rest_m=base.rest_m)
 
 
 def _gps_warnings(project: Project, check: GpsCheck) -> list[str]:

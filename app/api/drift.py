@@ -12,10 +12,12 @@ from app.answers import plain
 from app.api.projects import Body
 from app.context import Context, Folder, Here
 from app.errors import Missing
+from app.outcome import by_method
 from app.store import ProjectFolder
 from core.coordinates import Floats
 from core.drift import amplitude_spectrum, corner_sweep, filter_warnings, high_pass
 from core.errors import InputError
+from core.export import unfiltered_history
 from core.project import Drift, Positive
 from core.results import TargetHistory
 
@@ -40,7 +42,7 @@ class Filter(Body):
 def drift(wanted: Filter, folder: Folder, here: Here) -> dict[str, Any]:
     """Return the uncorrected displacement and what a filter makes of it, with warnings in words."""
     history, raw = _raw(here, folder, wanted.target, wanted.point)
-    intervals = folder.load().project.intervals_s
+    intervals, steady = folder.load().project.intervals_s, _steady(here, folder, wanted)
     filtered = high_pass(raw, history.time_s, wanted.corner_hz, wanted.order)
     at_rest = None
     if wanted.interval is not None:
@@ -52,7 +54,9 @@ def drift(wanted: Filter, folder: Folder, here: Here) -> dict[str, Any]:
         "status": history.status.tolist(),
         "raw": _axes(raw),
         "filtered": _axes(filtered),
-        "warnings": filter_warnings(raw, filtered, history.time_s, intervals, corner_hz=wanted.corner_hz),
+        "warnings": filter_warnings(
+            raw, filtered, history.time_s, intervals, corner_hz=wanted.corner_hz, steady_m=steady
+        ),
         "filtered_pre_event_rms_m": at_rest,
     }
 
@@ -81,6 +85,19 @@ def spectrum(
 def _raw(here: Context, folder: ProjectFolder, target: str, point: PointName) -> tuple[TargetHistory, Floats]:
     history = here.outcomes.history(folder, folder.load().project, target)
     return history, np.asarray(history.p1_raw_m if point == "p1" else history.p2_raw_m)
+
+
+def _steady(here: Context, folder: ProjectFolder, wanted: Filter) -> Floats | None:
+    """Return what the geometric method measured, without a filter, where it has measured."""
+    project = folder.load().project
+    if "geometric" not in here.outcomes.methods(folder, project):
+        return None
+    if by_method(project, "geometric").drift.filter == "none":
+        history = here.outcomes.history(folder, project, wanted.target, "geometric")
+    else:
+        target = next(target for target in project.targets if target.name == wanted.target)
+        history = unfiltered_history(here.outcomes.solved(folder, project, "geometric").solution, target)
+    return history.p1_m if wanted.point == "p1" else history.p2_m
 
 
 def _axes(values: Floats) -> dict[str, Any]:

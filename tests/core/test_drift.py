@@ -209,6 +209,17 @@ def test_warnings_name_residual_frequency_and_restless_pre_event() -> None:
     assert any("the paper accepts less than 1 cm" in text for text in slow)
 
 
+def test_a_residual_that_drift_hides_is_seen_where_the_displacement_is_free_of_drift() -> None:
+    time_s = clock(60)
+    still = np.zeros(len(time_s))
+    steady = np.column_stack([0.085 * np.clip((time_s - 38) / 3, 0, 1) + burst(time_s, 2.5, 0.3), still])
+    moved = steady + np.column_stack([drift_below(0.25, time_s, seed=6, rms_m=0.2), still])
+    filtered = high_pass(moved, time_s, 0.25)
+    assert filter_warnings(moved, filtered, time_s, INTERVALS, corner_hz=0.25) == []
+    (warning,) = filter_warnings(moved, filtered, time_s, INTERVALS, corner_hz=0.25, steady_m=steady)
+    assert "removes the residual displacement along x (east): 8.5 cm by the geometric method" in warning
+
+
 def test_warns_of_a_pre_event_shorter_than_a_period() -> None:
     time_s = clock(60)
     short = Intervals(pre_event=(0.0, 3.0))
