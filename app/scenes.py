@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from app import orthoimages
 from app.context import Context
-from app.errors import ApiError
+from app.errors import ApiError, NotYet
 from app.frames import fingerprint, scaled_to
 from app.outcome import Solved, recorded_of
 from app.reference import reference_fit
@@ -48,16 +48,15 @@ class View:
 
 
 def show(here: Context, folder: ProjectFolder, view: View) -> dict[str, Any]:
-    """Bring the scene up to date with a project and a view; return what is shown of it.
-
-    Raises:
-        NotYet: the cloud is still being read.
-    """
+    """Bring the scene up to date with a project and a view; return what is shown of it, or why nothing is yet."""
     project = folder.load().project
-    site = here.sites.site(folder, project) if project.inputs.cloud else None
+    try:
+        site = here.sites.site(folder, project) if project.inputs.cloud else None
+    except NotYet as error:
+        return _nothing(error.message)
     fit, problem = _fit(here, folder, project)
     if site is None and fit is None:
-        return {"ready": False, "points_shown": 0, "points_total": 0, "message": problem}
+        return _nothing(problem)
     origin = site.cloud.origin_m if site is not None else np.array([*_origin_of(fit), 0.0])
     here.scene.open(folder.id, origin, lambda start, along: _picked(here, folder, start, along))
     shown = _show_site(here, folder, site, view) if site is not None else 0
@@ -69,6 +68,10 @@ def show(here: Context, folder: ProjectFolder, view: View) -> dict[str, Any]:
     here.scene.show(view.show or {})
     total = len(site.cloud) if site is not None else 0
     return {"ready": True, "points_shown": shown, "points_total": total, "message": problem}
+
+
+def _nothing(message: str) -> dict[str, Any]:
+    return {"ready": False, "points_shown": 0, "points_total": 0, "message": message}
 
 
 def _fit(here: Context, folder: ProjectFolder, project: Project) -> tuple[ReferenceFit | None, str]:

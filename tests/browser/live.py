@@ -26,6 +26,10 @@ from sample_data.catalogue import build
 from sample_data.make import make
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "sample"
+# The viewer's module for Gaussian splats, which no scene of ours holds, wants to make functions out of text. Its page's
+# policy forbids that to everybody, since messages could then run text as script; the module's complaint is its end.
+EVAL_OF_THE_VIEWER = "'unsafe-eval' is not an allowed source of script"
+CHROMIUM_OPTIONS = ("--no-sandbox", "--enable-unsafe-swiftshader")  # WebGL without a graphics card
 CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -58,7 +62,7 @@ def chromium() -> Iterator[Browser]:
     """The computer's own Chromium, or else the one Playwright brought."""
     path = next((found for name in CHROMIUM_NAMES if (found := shutil.which(name))), None)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=path, args=CHROMIUM_OPTIONS)
         yield browser
         browser.close()
 
@@ -70,8 +74,10 @@ def watched(browser: Browser, address: str, **options: Any) -> Iterator[Page]:
     context: BrowserContext = browser.new_context(**{"viewport": {"width": 1440, "height": 900}, **options})
     context.set_default_timeout(45_000)
     page = context.new_page()
-    page.on("pageerror", lambda error: troubles.append(f"threw {error}"))
+    page.on("pageerror", lambda error: _note_error(str(error), troubles))
     page.on("request", lambda request: _note_outside(request.url, address, troubles))
+    page.on("websocket", lambda socket: _note_outside(socket.url, address, troubles))
+    page.on("console", lambda message: _note_error(message.text, troubles) if message.type == "error" else None)
     page.on(
         "response", lambda answer: troubles.append(f"{answer.status} {answer.url}") if answer.status >= 500 else None
     )
@@ -84,6 +90,12 @@ def _note_outside(url: str, address: str, troubles: list[str]) -> None:
     asked = urlsplit(url)
     if asked.scheme not in ("data", "blob") and asked.netloc != urlsplit(address).netloc:
         troubles.append(f"asked {url}")
+
+
+def _note_error(words: str, troubles: list[str]) -> None:
+    # An answer that refuses something is the page's to tell; one of 500 and more is noted as such.
+    if not words.startswith("Failed to load resource") and EVAL_OF_THE_VIEWER not in words:
+        troubles.append(f"said {words}")
 
 
 def shared_folder(factory: pytest.TempPathFactory) -> Path:
@@ -128,3 +140,9 @@ def ask(pages: str, path: str) -> Any:
     """Return what the server answers about a project, given the address of its pages."""
     with urllib.request.urlopen(f"{pages.replace('/p/', '/api/projects/')}/{path}".rstrip("/")) as answer:
         return json.load(answer)
+
+
+def ask_bytes(pages: str, path: str) -> bytes:
+    """Return a picture the server makes of a project, given the address of its pages."""
+    with urllib.request.urlopen(f"{pages.replace('/p/', '/api/projects/')}/{path}") as answer:
+        return answer.read()

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from io import BytesIO
 from typing import Any
 
 import numpy as np
+from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
 from core.coordinates import Floats
@@ -24,6 +26,14 @@ NO_DOUBLE_CLICK_MS = 400
 def saved(page: Page) -> None:
     """Wait until every edit is on the disk."""
     expect(page.locator(".save-state")).to_have_attribute("data-state", "saved")
+
+
+def pixels(page: Page) -> np.ndarray:
+    """Return what the window shows without marks and captions, grey, device px."""
+    page.evaluate("document.querySelectorAll('.pane > *:not(canvas)').forEach(e => e.style.visibility = 'hidden')")
+    picture = Image.open(BytesIO(page.screenshot())).convert("L")
+    page.evaluate("document.querySelectorAll('.pane > *').forEach(e => e.style.visibility = '')")
+    return np.asarray(picture, dtype=np.float32)
 
 
 def to_step(page: Page, name: str) -> None:

@@ -5,19 +5,16 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import urllib.request
-from io import BytesIO
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 from playwright.sync_api import Page, expect
 
 from core.lens import read_lens
 from core.project import read_project
 from tests.browser.hands import centre_of, fitted, zoomed
-from tests.browser.live import SAMPLE, ask, free_port, serving, watched
+from tests.browser.live import SAMPLE, ask, ask_bytes, free_port, serving, watched
 from tests.browser.steps import (
     FRAME_SIZE,
     draw_bands,
@@ -25,6 +22,7 @@ from tests.browser.steps import (
     ortho_px,
     outline,
     pane,
+    pixels,
     ready,
     saved,
     tell_height,
@@ -33,6 +31,8 @@ from tests.browser.steps import (
 WITHIN_PX = 0.5
 # A click falls on a whole CSS pixel, and the wheel has zoomed to six or more of them per pixel of the picture.
 CLICK_PX = 0.15
+# Grey levels: corners drawn on a plain surface scatter by less, the squares of a board by more.
+BLANK_LEVELS = 35
 
 
 @pytest.fixture(scope="module")
@@ -60,14 +60,6 @@ def project(server, request):
 @pytest.fixture(scope="module")
 def truth():
     return read_project(SAMPLE)
-
-
-def pixels(page: Page) -> np.ndarray:
-    """Return what the window shows without marks and captions, grey, device px."""
-    page.evaluate("document.querySelectorAll('.pane > *:not(canvas)').forEach(e => e.style.visibility = 'hidden')")
-    picture = Image.open(BytesIO(page.screenshot())).convert("L")
-    page.evaluate("document.querySelectorAll('.pane > *').forEach(e => e.style.visibility = '')")
-    return np.asarray(picture, dtype=np.float32)
 
 
 @pytest.mark.parametrize("ratio", [1, 2])
@@ -100,11 +92,6 @@ def test_pixels_and_marks_lie_where_the_engine_says(browser, project, truth, rat
             page.evaluate("[...document.querySelectorAll('.pane > canvas')].map(c => c.width)")
             == [round(box["width"] * ratio)] * 2
         )
-
-
-def ask_bytes(pages: str, path: str) -> bytes:
-    with urllib.request.urlopen(f"{pages.replace('/p/', '/api/projects/')}/{path}") as answer:
-        return answer.read()
 
 
 def test_an_edit_is_undone_after_a_reload(browser, project):
@@ -225,7 +212,8 @@ def test_regions_and_bands_are_drawn_and_previewed_as_the_engine_sees_them(brows
             flat = fitted(page, plan, size).window(ortho_px(grid, seen[name]["plan"]))
             assert centre_of(page.locator(f"#plan [data-id='found:{name}']")) == pytest.approx(flat, abs=WITHIN_PX)
 
-        drag_band(page, plan, size, grid, made.lines.L1)
+        inside = np.array(made.lines.L1.from_m) * 0.8 + np.array(made.lines.L1.to_m) * 0.2
+        drag(page, plan, size, grid, inside, [0.0, 0.5])
         saved(page)
         moved = read_project(folder).targets[0].lines.L1
         assert np.array(moved.from_m) - made.lines.L1.from_m == pytest.approx([0.0, 0.5], abs=0.03)
@@ -235,6 +223,11 @@ def test_regions_and_bands_are_drawn_and_previewed_as_the_engine_sees_them(brows
         nudged = read_project(folder).targets[0].lines.L1
         assert nudged.from_m[1] - moved.from_m[1] == pytest.approx(grid["pixel_size_m"], abs=2e-4)
         assert nudged.width_m - moved.width_m == pytest.approx(0.02)
+        drag(page, plan, size, grid, np.array(nudged.to_m), [0.4, 0.1])
+        saved(page)
+        turned = read_project(folder).targets[0].lines.L1
+        assert (turned.from_m, turned.width_m) == (nudged.from_m, nudged.width_m)
+        assert np.array(turned.to_m) - nudged.to_m == pytest.approx([0.4, 0.1], abs=0.01)
 
 
 def preview(page: Page, pages: str, target) -> dict:
@@ -244,15 +237,62 @@ def preview(page: Page, pages: str, target) -> dict:
     return page.request.post(f"{address}/lines/preview", data=body, headers=headers).json()
 
 
-def drag_band(page: Page, plan, size, grid, band) -> None:
-    """Drag a band half a metre to the north by its inside."""
-    middle = np.array(band.from_m) * 0.8 + np.array(band.to_m) * 0.2
-    lies = zoomed(page, plan, size, ortho_px(grid, middle), 900.0)
-    page.mouse.move(*lies.window(ortho_px(grid, middle)))
+def drag(page: Page, plan, size, grid, place, by) -> None:
+    """Drag what lies at a place of the plan, metres: a band by its inside, or one of its handles."""
+    lies = zoomed(page, plan, size, ortho_px(grid, place), 900.0)
+    page.mouse.move(*lies.window(ortho_px(grid, place)))
     page.mouse.down()
-    page.mouse.move(*lies.window(ortho_px(grid, middle + [0.0, 0.25])))
-    page.mouse.move(*lies.window(ortho_px(grid, middle + [0.0, 0.5])))
+    for share in (0.5, 1.0):
+        page.mouse.move(*lies.window(ortho_px(grid, place + share * np.array(by))))
     page.mouse.up()
+
+
+def test_a_target_is_measured_relative_to_another(browser, project):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    (roof,) = document["targets"]
+    table = roof | {"name": "table", "height_m": 1.2}
+    (folder / "project.json").write_text(json.dumps(document | {"targets": [roof, table]}))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions?target=roof")
+        relative = page.get_by_label("Displacement relative to")
+        expect(relative.locator("option")).to_have_text(["its own rest position", "table"])
+        relative.select_option("table")
+        saved(page)
+        assert [target.relative_to for target in read_project(folder).targets] == ["table", None]
+        page.locator("#targets li[data-target=table]").click()
+        expect(relative.locator("option")).to_have_text(["its own rest position"])  # neither itself nor in a circle
+        page.reload()
+        page.locator("#targets li[data-target=roof]").click()
+        expect(relative).to_have_value("table")
+        page.get_by_role("button", name="Actions for table").click()
+        page.get_by_role("menuitem", name="Delete").click()
+        saved(page)
+    assert [(target.name, target.relative_to) for target in read_project(folder).targets] == [("roof", None)]
+
+
+def test_the_columns_of_another_gps_file_are_told(browser, project):
+    folder, pages = project
+    rows = (SAMPLE / "gps.csv").read_text().splitlines()
+    (folder / "rover.csv").write_text("\n".join(["seconds,E,N", *rows[1:]]) + "\n")
+    document = json.loads((folder / "project.json").read_text())
+    document["inputs"]["gps"] = {"file": "rover.csv"}
+    (folder / "project.json").write_text(json.dumps(document))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/inputs")
+        card = page.locator(".input-card[data-kind=gps]")
+        expect(card.locator(".note.bad")).to_contain_text("time_s")
+        card.get_by_role("button", name="Columns…").click()
+        dialog = page.get_by_role("dialog")
+        for label, column in (("Time, s", "seconds"), ("East, m", "E"), ("North, m", "N")):
+            dialog.get_by_label(label).fill(column)
+        dialog.get_by_label("Antenna east").fill("0.5")
+        dialog.get_by_label("Antenna north").fill("-1.25")
+        dialog.get_by_role("button", name="Save").click()
+        expect(card.locator(".badge")).to_have_text("understood")
+        expect(card).to_contain_text(f"{len(rows) - 1}")
+    gps = read_project(folder).inputs.gps
+    assert (gps.time, gps.x, gps.y, gps.at_m) == ("seconds", "E", "N", (0.5, -1.25))
 
 
 def test_a_pair_is_placed_by_the_keyboard_alone(browser, project):
@@ -310,10 +350,21 @@ def test_inputs_are_sent_taken_back_and_calibrated(browser, project, tmp_path):
         page.get_by_role("button", name="Calibrate", exact=True).click()
         report = page.get_by_role("region", name="Calibration report")
         expect(report).to_contain_text("pictures used", timeout=60_000)
+        board_is_shown(page, report)
         expect(lens.locator(".badge")).to_have_text("understood")
     assert read_lens(folder / read_project(folder).inputs.lens).focal_px[0] == pytest.approx(
         read_lens(SAMPLE / "lens.yaml").focal_px[0], rel=0.02
     )
+
+
+def board_is_shown(page: Page, report) -> None:
+    """The picture chosen by its path lies under the corners found in it: it is no plain surface."""
+    board = report.get_by_role("application", name="Checkerboard picture")
+    expect(board).to_have_attribute("data-picture", re.compile(r"\d+x\d+"))
+    page.wait_for_timeout(500)
+    shown = cv2.imdecode(np.frombuffer(board.screenshot(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    middle = shown[shown.shape[0] // 4 : -shown.shape[0] // 4, shown.shape[1] // 4 : -shown.shape[1] // 4]
+    assert middle.std() > BLANK_LEVELS
 
 
 def test_an_upload_that_is_cancelled_leaves_nothing(browser, project, tmp_path):

@@ -5,6 +5,7 @@ import { fill, h } from "../lib/dom.js";
 import { pointsShown } from "../lib/graphics.js";
 
 const LEAST_PAUSE_MS = 80;
+const ASKS_AGAIN_MS = 1000;
 
 export class SceneView {
   #active = false;
@@ -79,14 +80,21 @@ export class SceneView {
     while (this.#changed && this.#active) {
       this.#changed = false;
       try {
-        const answer = await post(projectPath(this.projectId, "scene"), this.#wish);
-        this.#tell(answer?.ready === false ? answer.message : "");
+        const { ready, message } = await post(projectPath(this.projectId, "scene"), this.#wish);
+        this.#tell(ready ? "" : message);
+        if (!ready) await this.#later();
       } catch (error) {
         this.#tell(sentence(error));
       }
       await new Promise((resolve) => window.setTimeout(resolve, LEAST_PAUSE_MS));
     }
     this.#sending = false;
+  }
+
+  /** The cloud is still being read: ask again. */
+  async #later() {
+    await new Promise((resolve) => window.setTimeout(resolve, ASKS_AGAIN_MS));
+    this.#changed = true;
   }
 
   /** @param {string} words */

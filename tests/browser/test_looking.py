@@ -1,0 +1,184 @@
+"""What is looked at side by side: two pictures swiped, blended and linked, the scene in step with the player."""
+
+from __future__ import annotations
+
+import shutil
+from io import BytesIO
+from urllib.parse import parse_qs, urlsplit
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Locator, Page, expect
+
+from app.scene3d import LINE_COLOURS
+from tests.browser.hands import Placement, fitted, zoomed
+from tests.browser.live import ask, ask_bytes, free_port, measured_sample, serving, shared_folder, watched
+from tests.browser.steps import FRAME_SIZE, pane, pixels, ready
+
+STEPS = ("inputs", "orthoimage", "correspondences", "regions", "track", "review?view=both", "drift", "export")
+# Levels by which a line's colour in the scene may differ from the one it was given: its edges are smoothed.
+ALIKE_LEVELS = 40
+FAR_PX = 40
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """The address of the pages of the shipped sample, measured; no test changes it."""
+    workspace = tmp_path_factory.mktemp("workspace")
+    shutil.copytree(measured_sample(shared_folder(tmp_path_factory) / "measured-sample"), workspace / "sample")
+    with serving(workspace, free_port()) as address:
+        yield f"{address}/p/sample"
+
+
+def test_no_page_throws_or_asks_another_computer(browser, pages):
+    with watched(browser, pages) as page:
+        for address in (pages.split("/p/")[0], *(f"{pages}/{step}" for step in STEPS)):
+            page.goto(address)
+            page.wait_for_load_state("load")
+            expect(page.locator("#main > *").first).to_be_visible()
+            page.wait_for_timeout(1500)  # pictures, plots and the scene arrive
+
+
+def grey(picture: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Return a picture and where it is opaque."""
+    decoded = np.asarray(Image.open(BytesIO(picture)).convert("RGBA"))
+    return cv2.cvtColor(decoded, cv2.COLOR_RGBA2GRAY), decoded[..., 3] == 255
+
+
+def as_shown(picture: np.ndarray, lies: Placement, size: tuple[int, int], box: dict[str, float]) -> np.ndarray:
+    """Return a picture over an image of (width, height) as a pane shows it, window px."""
+    width, height = (round(lies.scale * side) for side in size)
+    small = cv2.resize(picture.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    shown = np.full((round(box["height"]), round(box["width"])), np.nan, np.float32)
+    left, top = np.round(lies.corner - [box["x"], box["y"]]).astype(int)
+    shown[top : top + height, left : left + width] = small[: shown.shape[0] - top, : shown.shape[1] - left]
+    return shown
+
+
+def test_the_frame_is_swiped_and_blended_over_the_orthoimage(browser, pages):
+    grid = ask(pages, "orthoimage")["grid"]
+    size = (grid["width"], grid["height"])
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Orthoimage")
+        ortho = pane(page, "Orthoimage")
+        lies, box = fitted(page, ortho, size), ortho.bounding_box()
+        ground, opaque = grey(ask_bytes(pages, "orthoimage.png"))
+        frame, _ = grey(ask_bytes(pages, "rectified.jpg?pixels=4000000"))
+        ground, frame = as_shown(ground, lies, size, box), as_shown(frame, lies, size, box)
+        both = as_shown(opaque, lies, size, box) == 1
+        left = np.arange(ground.shape[1])[None] < ground.shape[1] // 2
+
+        seen = comparison(page, ortho, "Swipe")
+        assert likeness(seen, frame, both & left) > 0.9 > likeness(seen, ground, both & left)
+        assert likeness(seen, ground, both & ~left) > 0.9 > likeness(seen, frame, both & ~left)
+        seen = comparison(page, ortho, "Blend")
+        alone = max(likeness(seen, frame, both), likeness(seen, ground, both))
+        assert likeness(seen, (frame + ground) / 2, both) > max(0.97, alone)
+        for _ in range(5):
+            page.keyboard.press("]")
+        assert likeness(shown_by(page, ortho), frame, both) > 0.97
+        assert likeness(comparison(page, ortho, "Ortho"), ground, both) > 0.9
+
+
+def comparison(page: Page, ortho: Locator, name: str) -> np.ndarray:
+    """Choose how the two pictures are compared and return what the pane shows then."""
+    group = page.get_by_role("group", name="Compare with the orthorectified frame")
+    group.get_by_role("button", name=name, exact=True).click()
+    page.wait_for_timeout(1500)  # the frame is laid on the ground by the server
+    return shown_by(page, ortho)
+
+
+def shown_by(page: Page, ortho: Locator) -> np.ndarray:
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    box = ortho.bounding_box()
+    left, top = round(box["x"]), round(box["y"])
+    return pixels(page)[top : top + round(box["height"]), left : left + round(box["width"])]
+
+
+def likeness(seen: np.ndarray, expected: np.ndarray, where: np.ndarray) -> float:
+    """Return the correlation of two pictures in a part of them."""
+    return float(np.corrcoef(seen[where], expected[where])[0, 1])
+
+
+def test_linked_views_look_at_the_same_ground(browser, pages):
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame"), ready(page, "Orthoimage")
+        before = looked_at(page, "ortho")
+        zoomed(page, pane(page, "Reference frame"), FRAME_SIZE, np.array([300.0, 500.0]), 1200.0)
+        page.wait_for_timeout(500)
+        assert looked_at(page, "ortho") == before  # a view follows only when it is asked to
+        page.keyboard.press("l")
+        zoomed(page, pane(page, "Reference frame"), FRAME_SIZE, np.array([900.0, 560.0]), 1500.0)
+        page.wait_for_timeout(1000)
+        u, v, scale = looked_at(page, "frame")
+        step_px = 40 / scale
+        middle, beside = led(page, pages, "raw", "ortho", [[u, v], [u + step_px, v]])
+        at = looked_at(page, "ortho")
+        assert at[:2] == pytest.approx(middle, abs=0.5)
+        assert at[2] == pytest.approx(40 / np.hypot(*(beside - middle)), rel=0.01)
+
+
+def looked_at(page: Page, view: str) -> list[float] | None:
+    """Return the middle of a pane, px of its picture, and its scale, as the address tells them."""
+    page.wait_for_timeout(400)
+    found = parse_qs(urlsplit(page.url).query).get(view)
+    return None if found is None else [float(value) for value in found[0].split(",")]
+
+
+def led(page: Page, pages: str, source: str, to: str, points: list[list[float]]) -> np.ndarray:
+    """Return where the engine says that points of one picture lie in another."""
+    answer = page.request.post(
+        f"{pages.replace('/p/', '/api/projects/')}/transform",
+        data={"from": source, "to": to, "points": points},
+        headers={"X-Rooftrack": "1", "Origin": pages.split("/p/")[0]},
+    )
+    return np.array(answer.json()["points"])
+
+
+def test_the_scene_follows_the_player_and_exaggerates_the_motion(browser, pages):
+    history = ask(pages, "results/roof")
+    peak = int(np.nanargmax(np.abs(np.array(history["p1_dx_m"], dtype=float))))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/review?view=scene&frame=0")
+        scene = page.frame_locator("iframe.scene-frame")
+        expect(scene.locator("canvas").first).to_be_visible(timeout=60_000)
+        slider = page.get_by_role("slider", name="Exaggeration of the roof's motion")
+        slider.focus()
+        slider.press("End")
+        expect(page.locator(".scene-bar output")).to_have_text("100×")
+        at_rest = roof_line(page)
+        page.evaluate(SCRUB, peak)
+        moved = roof_line(page)
+        assert np.hypot(*(moved - at_rest)) > FAR_PX  # a third of a metre, a hundred times
+        slider.focus()
+        slider.press("Home")
+        assert np.hypot(*(roof_line(page) - at_rest)) < FAR_PX / 4
+
+
+SCRUB = """(frame) => {
+    const scrubber = document.querySelector(".player-scrubber");
+    scrubber.value = String(frame);
+    scrubber.dispatchEvent(new Event("input", { bubbles: true }));
+}"""
+
+
+def roof_line(page: Page) -> np.ndarray:
+    """Return the middle of line L1 in the scene, window px, as soon as it has stopped moving."""
+    frame = page.locator("iframe.scene-frame")
+    before = None
+    for _ in range(40):
+        page.wait_for_timeout(800)  # the scene fades in, and follows with a little delay
+        picture = np.asarray(Image.open(BytesIO(frame.screenshot())).convert("RGB"), np.int16)
+        alike = np.abs(picture - LINE_COLOURS["L1"]).max(axis=2) < ALIKE_LEVELS
+        alike[:, : alike.shape[1] // 3] = False  # the slider has the same blue
+        rows, columns = np.nonzero(alike)
+        if len(rows) > 5:
+            middle = np.array([np.median(columns), np.median(rows)])
+            if before is not None and np.abs(middle - before).max() < 2:
+                return middle
+            before = middle
+    pytest.fail("the line was not seen, or never came to rest")
