@@ -70,6 +70,11 @@ class FrameIndex:
         return len(self.ticks)
 
     @property
+    def key_frames(self) -> list[int]:
+        """Numbers of the frames that decoding can begin with, ascending."""
+        return [int(number) for number in np.searchsorted(self.ticks, self.key_ticks)]
+
+    @property
     def time_s(self) -> NDArray[np.float64]:
         """(F,) seconds since the first presented frame."""
         return (np.array(self.ticks, dtype=np.float64) - self.ticks[0]) * self.tick_s
@@ -158,11 +163,14 @@ def _frame_index(path: Path, size: int, modified_ns: int) -> FrameIndex:
     return FrameIndex(ticks=tuple(sorted(ticks)), key_ticks=tuple(sorted(keys)), tick_s=tick_s)
 
 
-def read_frames(path: Path, start: int = 0, stop: int | None = None, *, threads: int = 0) -> Iterator[Frame]:
+def read_frames(
+    path: Path, start: int = 0, stop: int | None = None, *, threads: int = 0, index: FrameIndex | None = None
+) -> Iterator[Frame]:
     """Yield frames `start` to `stop` (exclusive; None for all), decoding ahead in a thread of its own.
 
     Args:
         threads: decoder threads, 0 for one per core.
+        index: of the file, where it is known already; read where it is needed and None.
 
     Raises:
         InputError: the file cannot be read, or `start` lies beyond its end.
@@ -181,7 +189,7 @@ def read_frames(path: Path, start: int = 0, stop: int | None = None, *, threads:
 
     def decode() -> None:
         try:
-            for frame in _decoded(path, start, stop, threads):
+            for frame in _decoded(path, start, stop, threads, index):
                 if not hand_over(frame):
                     return
             hand_over(None)
@@ -200,15 +208,18 @@ def read_frames(path: Path, start: int = 0, stop: int | None = None, *, threads:
         thread.join()
 
 
-def read_frame(path: Path, index: int) -> Frame:
+def read_frame(path: Path, number: int, *, index: FrameIndex | None = None) -> Frame:
     """Return one frame by its number.
+
+    Args:
+        index: as for `read_frames`.
 
     Raises:
         InputError: as `read_frames`, or there is no such frame.
     """
-    for frame in _decoded(path, index, index + 1, 0):
+    for frame in _decoded(path, number, number + 1, 0, index):
         return frame
-    raise InputError(f"{path}: has no frame {index}; choose a smaller frame number.")
+    raise InputError(f"{path}: has no frame {number}; choose a smaller frame number.")
 
 
 def read_frame_rgb(path: Path, index: int) -> NDArray[np.uint8]:
@@ -228,26 +239,28 @@ def read_frames_rgb(path: Path, start: int = 0, stop: int | None = None) -> Iter
     Raises:
         InputError: as `read_frames`.
     """
-    for picture, index in _pictures(path, start, stop, 0):
+    for picture, index in _pictures(path, start, stop, 0, None):
         yield index, np.ascontiguousarray(np.rot90(picture.to_ndarray(format="rgb24"), picture.rotation // 90))
 
 
-def _decoded(path: Path, start: int, stop: int | None, threads: int) -> Iterator[Frame]:
-    first_tick: int | None = frame_index(path).ticks[0] if start > 0 else None
-    for picture, index in _pictures(path, start, stop, threads):
+def _decoded(path: Path, start: int, stop: int | None, threads: int, index: FrameIndex | None) -> Iterator[Frame]:
+    first_tick: int | None = (index or frame_index(path)).ticks[0] if start > 0 else None
+    for picture, number in _pictures(path, start, stop, threads, index):
         if first_tick is None:
             first_tick = picture.pts or 0
         time_s = float(((picture.pts or 0) - first_tick) * (picture.time_base or 0))
-        yield Frame(index=index, time_s=time_s, luma=luma_of(picture))
+        yield Frame(index=number, time_s=time_s, luma=luma_of(picture))
 
 
-def _pictures(path: Path, start: int, stop: int | None, threads: int) -> Iterator[tuple[VideoFrame, int]]:
+def _pictures(
+    path: Path, start: int, stop: int | None, threads: int, index: FrameIndex | None
+) -> Iterator[tuple[VideoFrame, int]]:
     """Yield decoded pictures with their frame numbers; numbers after a seek come from the timestamps alone."""
     with _opened(path) as (container, stream):
         stream.codec_context.thread_type = "AUTO"
         # Left to itself, FFmpeg takes one thread more than there are cores, which then get in each other's way.
         stream.codec_context.thread_count = threads or min(MOST_THREADS, available_cores())
-        position = _seek(container, stream, path, start) if start > 0 else None
+        position = _seek(container, stream, path, start, index) if start > 0 else None
         number = 0
         for picture in _until_damaged(container, stream):
             if position is not None:
@@ -271,9 +284,11 @@ def _until_damaged(container: InputContainer, stream: VideoStream) -> Iterator[V
             return
 
 
-def _seek(container: InputContainer, stream: VideoStream, path: Path, start: int) -> dict[int, int]:
+def _seek(
+    container: InputContainer, stream: VideoStream, path: Path, start: int, index: FrameIndex | None
+) -> dict[int, int]:
     """Go to the last key frame at or before frame `start`; return the frame number of every timestamp."""
-    index = frame_index(path)
+    index = index or frame_index(path)
     if start >= len(index):
         raise InputError(f"{path}: has {len(index)} frames, so there is no frame {start}; choose a smaller number.")
     keys = [tick for tick in index.key_ticks if tick <= index.ticks[start]]

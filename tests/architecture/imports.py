@@ -42,6 +42,8 @@ ORDER = (
     "bodies",
     "prediction",
     "paper",
+    "chunks",
+    "workers",
     "cluster",
     "measure",
     "preview",

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from app import cli
-from core import measure as measuring
+from core import cluster as tasks
 from core.results import read_history_csv
 from core.run import FRAMES_FILE, load_inputs
 from tests.scenes.clips import BRIEF, displacement, measured, measured_history, project_copy, rendered
@@ -85,7 +85,7 @@ def test_a_worker_that_dies_costs_time_and_nothing_else(clip, sequential, cluste
     address, workers = cluster
     folder = project_copy(clip, tmp_path / "clip")
     # Chunks short enough that each worker has several of them.
-    monkeypatch.setattr(measuring, "CLUSTER_CHUNK", 24)
+    monkeypatch.setattr(tasks, "TASK_FRAMES", 24)
     seen = []
 
     def watch(stage, done, total):

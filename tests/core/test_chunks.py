@@ -1,0 +1,59 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+
+from core.chunks import LEAST_FRAMES, WARM_UP, Chunk, missing_chunks
+from core.cluster import TASK_FRAMES, tasks_for
+from core.video import FrameIndex
+
+
+def index_of(total, keys):
+    """Return an index whose ticks are unevenly spaced, as a variable frame rate's are."""
+    ticks = tuple(512 * number + 97 * (number % 3) for number in range(total))
+    return FrameIndex(ticks, tuple(ticks[key] for key in keys), 1 / 15360)
+
+
+def covered(chunks):
+    return [frame for chunk in chunks for frame in range(chunk.start, chunk.stop)]
+
+
+@given(
+    total=some.integers(1, 700),
+    spacing=some.integers(1, 300),
+    parts=some.integers(1, 9),
+    done=some.sets(some.integers(0, 699), max_size=40),
+)
+def test_every_missing_frame_is_measured_once(total, spacing, parts, done):
+    chunks = missing_chunks(sorted(done), index_of(total, range(0, total, spacing)), parts)
+    assert covered(chunks) == [frame for frame in range(total) if frame not in done]
+    assert all(chunk.start < chunk.stop for chunk in chunks)
+
+
+def test_a_chunk_warms_up_from_a_key_frame_where_one_is_near():
+    chunks = missing_chunks([], index_of(900, range(0, 900, 30)), 2)
+    assert chunks == [Chunk(0, 450 + WARM_UP), Chunk(450 + WARM_UP, 900)]
+
+
+def test_parts_stay_equal_where_key_frames_are_rare():
+    # From frame 500 on would spare 400 frames nothing.
+    assert missing_chunks([], index_of(1000, [0, 990]), 2) == [Chunk(0, 500), Chunk(500, 1000)]
+
+
+def test_without_key_frames_before_it_a_chunk_begins_anyway():
+    assert missing_chunks([], index_of(100, [99]), 2) == [Chunk(0, 50), Chunk(50, 100)]
+
+
+def test_few_frames_are_one_chunk():
+    assert missing_chunks([], index_of(LEAST_FRAMES, [0]), 8) == [Chunk(0, LEAST_FRAMES)]
+
+
+def test_nothing_is_missing_when_all_is_done():
+    assert missing_chunks(list(range(40)), index_of(40, [0]), 3) == []
+
+
+@pytest.mark.parametrize(
+    ("frames", "workers", "tasks"), [(1800, 800, 8), (900, 2, 4), (700, 2, 4), (100, 2, 1), (1, 0, 1)]
+)
+def test_a_cluster_gets_tasks_of_a_size_that_leaves_no_worker_waiting(frames, workers, tasks):
+    assert tasks_for(frames, workers) == tasks
+    assert frames / tasks_for(frames, workers) <= TASK_FRAMES
