@@ -140,7 +140,7 @@ class Scene3D:
             camera = self._started().initial_camera
             # Half-way up to the camera in the sky, so that ground, building and flight are in view together.
             middle = at_m - self.origin_m + np.array([0.0, 0.0, 0.4 * size_m])
-            camera.position = tuple(middle + np.array([0.4, -2.0, 0.8]) * size_m)
+            camera.position = tuple(middle + np.array([0.35, -1.4, 0.55]) * size_m)
             camera.look_at = tuple(middle)
             camera.up = (0.0, 0.0, 1.0)
 

@@ -201,15 +201,17 @@ def _residual_warnings(
     if not np.isfinite(before[chosen]).all(axis=1).any():
         return []
     drift = np.zeros(2) if intervals.pre_event is None else _largest(before[within(times, intervals.pre_event)])
-    warnings = []
+    eaten = []
     for axis, name in enumerate(AXIS_NAMES):
         was, remains = float(np.nanmean(before[chosen, axis])), float(np.nanmean(after[chosen, axis]))
         if abs(was) > max(0.005, 1.5 * drift[axis]) and abs(remains) < 0.7 * abs(was):
-            warnings.append(
-                f"The filter removes the residual displacement along {name}: {100 * was:.1f} cm {source}, "
-                f"{100 * remains:.1f} cm after it. Use the geometric method without a filter where a residual matters."
-            )
-    return warnings
+            eaten.append(f"along {name} {100 * was:.1f} cm {source} and {100 * remains:.1f} cm after it")
+    if not eaten:
+        return []
+    return [
+        f"The filter removes the residual displacement: {', '.join(eaten)}. "
+        "Use the geometric method without a filter where a residual matters."
+    ]
 
 
 def _pre_event_warnings(after: Floats, times: Floats, intervals: Intervals, corner_hz: float) -> list[str]:

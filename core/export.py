@@ -172,7 +172,8 @@ def _measurement_warnings(history: TargetHistory) -> list[str]:
             "then correct the bands, the moving regions or the reference frame."
         ]
     if counts["lost"]:
-        return [f"{history.name}: {counts['lost']} of {asked} frames were lost; they have no values."]
+        were = "was lost; it has" if counts["lost"] == 1 else "were lost; they have"
+        return [f"{history.name}: {counts['lost']} of {asked} frames {were} no values."]
     return []
 
 

@@ -203,7 +203,7 @@ def test_warnings_name_residual_frequency_and_restless_pre_event() -> None:
     residual = 0.22 * np.clip((time_s - 38) / 3, 0, 1)
     moved = np.column_stack([drift_below(0.25, time_s, seed=6, rms_m=0.06) + residual, burst(time_s, 0.4, 0.3)])
     warnings = filter_warnings(moved, high_pass(moved, time_s, 0.25), time_s, INTERVALS, corner_hz=0.25)
-    assert any("removes the residual displacement along x (east)" in text and "2" in text for text in warnings)
+    assert any("removes the residual displacement: along x (east) 2" in text and "2" in text for text in warnings)
     assert any("comes near 0.4" in text and "along y (north)" in text for text in warnings)
     slow = filter_warnings(moved, high_pass(moved, time_s, 0.05), time_s, INTERVALS, corner_hz=0.05)
     assert any("the paper accepts less than 1 cm" in text for text in slow)
@@ -217,7 +217,7 @@ def test_a_residual_that_drift_hides_is_seen_where_the_displacement_is_free_of_d
     filtered = high_pass(moved, time_s, 0.25)
     assert filter_warnings(moved, filtered, time_s, INTERVALS, corner_hz=0.25) == []
     (warning,) = filter_warnings(moved, filtered, time_s, INTERVALS, corner_hz=0.25, steady_m=steady)
-    assert "removes the residual displacement along x (east): 8.5 cm by the geometric method" in warning
+    assert "removes the residual displacement: along x (east) 8.5 cm by the geometric method and " in warning
 
 
 def test_warns_of_a_pre_event_shorter_than_a_period() -> None:

@@ -2,8 +2,10 @@
 // one: fewer pixels while it moves, all of them as soon as it rests.
 
 import { Emitter } from "../lib/emitter.js";
+import { sentence } from "../lib/api.js";
 import { h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
+import { busyOver } from "./busy.js";
 import { Loupe } from "./loupe.js";
 import { Pane } from "./pane.js";
 import { overlayShapes, PointPainter } from "./review-overlay.js";
@@ -16,7 +18,7 @@ const PREPARED_BY_STEPPING = [1, -1, 2, -2];
 const PREPARED_BY_PLAYING = [1, 2, 3, 4, 5, 6, 7, 8];
 const RESTS_AFTER_MS = 140;
 
-/** @extends {Emitter<{shown: {review: FrameReview}}>} */
+/** @extends {Emitter<{shown: {review: FrameReview | null}}>} */
 export class FrameView extends Emitter {
   #wanted = 0;
   #shown = "";
@@ -24,6 +26,7 @@ export class FrameView extends Emitter {
   #moved_ms = 0;
   #resting = 0;
   #loupeOn = false;
+  #told = "";
   /** @type {FrameReview | null} */
   review = null;
   playing = false;
@@ -128,10 +131,13 @@ export class FrameView extends Emitter {
 
   /** @param {{frame: number, width: number | null, key: string}} next */
   async #showOne({ frame, width, key }) {
-    const [image, review] = await Promise.all([
-      this.library.image(frame, width),
-      this.library.review(frame, this.method),
-    ]);
+    const measured = this.library.review(frame, this.method).catch((error) => this.#without(error));
+    const image = await this.library.image(frame, width);
+    // The first overlay may have to wait for the engine to solve; a picture of its own is better than none.
+    if (this.pane.image === null) this.pane.setImage(image);
+    const solved = this.review === null ? busyOver(this.element, "Solving…") : () => undefined;
+    const review = await measured;
+    solved();
     this.pane.setImage(image);
     this.#shown = key;
     this.review = review;
@@ -140,6 +146,14 @@ export class FrameView extends Emitter {
     this.element.dataset.frame = String(frame);
     this.element.dataset.whole = String(image.isWhole);
     this.emit("shown", { review });
+  }
+
+  /** A frame without overlay is still worth looking at; why there is none is told once. @param {unknown} error */
+  #without(error) {
+    const words = sentence(error);
+    if (words !== this.#told) toastError(error);
+    this.#told = words;
+    return null;
   }
 
   /** What should be on the screen now. */
@@ -157,10 +171,9 @@ export class FrameView extends Emitter {
   }
 
   #showOverlay() {
-    if (this.review === null) return;
     this.painter.review = this.review;
     this.painter.shown = this.layers;
-    this.pane.setShapes(overlayShapes(this.review, this.layers));
+    this.pane.setShapes(this.review === null ? [] : overlayShapes(this.review, this.layers));
   }
 
   /** The loupe needs every pixel, so it rests while fewer are shown. */

@@ -62,8 +62,7 @@ async function load() {
 
 /** @param {Listed} project */
 function card(project) {
-  const next = STEPS.find(({ step }) => project.steps[step].status !== "done") ?? STEPS[STEPS.length - 1];
-  const doneCount = STEPS.filter(({ step }) => ["done", "warn"].includes(project.steps[step].status)).length;
+  const next = STEPS.find(({ step }) => project.steps[step].status !== "done");
   const steps = STEPS.map(({ step, name }, i) => {
     const { status, message } = project.steps[step];
     return h(
@@ -77,7 +76,6 @@ function card(project) {
       ),
     );
   });
-  const message = project.steps[next.step].message;
   return h(
     "article",
     { class: "card project-card", "data-project": project.id },
@@ -96,7 +94,11 @@ function card(project) {
       actions(project),
     ),
     h("ol", { class: "step-strip", "aria-label": "Steps" }, steps),
-    h("p", { class: "small soft" }, doneCount === STEPS.length ? "All steps done." : `${next.name}: ${message}`),
+    h(
+      "p",
+      { class: "small soft" },
+      next === undefined ? "All steps done." : `${next.name}: ${project.steps[next.step].message}`,
+    ),
   );
 }
 

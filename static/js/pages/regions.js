@@ -365,3 +365,5 @@ draw();
 await Promise.all([loadFrame(), loadPlan()]);
 const drawn = Object.values(bands.bands).flatMap(cornersOf).map(toPixels);
 if (drawn.length > 0 && planPane.image !== null) planPane.lookAtAll(drawn);
+const outlines = store.project.moving_regions_px.flat();
+if (outlines.length > 0 && framePane.image !== null) framePane.lookAtAll(outlines);

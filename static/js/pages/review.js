@@ -8,7 +8,8 @@ import { busyOver } from "../components/busy.js";
 import { ExclusionEditor } from "../components/exclusions.js";
 import { FrameLibrary } from "../components/frames.js";
 import { FrameView } from "../components/frame-view.js";
-import { AXES, fetchHistory, fetchResults, methodName, worstStatuses } from "../components/histories.js";
+import { AXES, fetchHistory, fetchResults, methodName, METHODS, worstStatuses } from "../components/histories.js";
+import { stepUrl } from "../components/header.js";
 import { whenMeasured } from "../components/measured.js";
 import { openPage } from "../components/page.js";
 import { paneKeys } from "../components/pane-keys.js";
@@ -46,7 +47,7 @@ const { video } = await get(projectPath(page.id, "inputs"));
 // what is looked at
 let method = results.methods.find((name) => name === viewText("method")) ?? store.project.method;
 let target = results.targets.find((name) => name === viewText("target")) ?? results.targets[0] ?? "";
-let compared = viewText("compare") === "1";
+let compared = viewText("compare") === "1" && results.methods.length > 1;
 let stage = STAGES.find((entry) => entry.value === viewText("view"))?.value ?? "frame";
 /** @type {Set<Layer>} */
 const layers = new Set(LAYERS.map((entry) => entry.layer));
@@ -85,8 +86,7 @@ const doubtful = h("section", { class: "section", "aria-label": "Weak and lost f
 const excluded = h("section", { class: "section", "aria-label": "Excluded frames" });
 const layerList = h("section", { class: "section", "aria-label": "Overlay" });
 targetChoice.element.hidden = results.targets.length < 2;
-methodChoice.element.hidden = compareSwitch.disabled = results.methods.length < 2;
-compareLabel.title = compareSwitch.disabled ? "Track with the other method too; then both can be compared." : "";
+methodChoice.element.hidden = results.methods.length < 2;
 fill(
   find("#main"),
   h(
@@ -156,7 +156,6 @@ function listen() {
 
 /** @returns {import("../lib/keys.js").KeyBinding[]} */
 function keys() {
-  const several = () => results.methods.length > 1;
   return [
     { keys: "Space / K", group: "Player", label: "Play or pause", run: () => player.toggle() },
     {
@@ -210,7 +209,7 @@ function keys() {
       label: entry.name,
       run: () => setLayer(entry.layer, !layers.has(entry.layer)),
     })),
-    { keys: "M", group: "Overlay", label: "Compare methods", run: () => compare(!compared), when: several },
+    { keys: "M", group: "Overlay", label: "Compare methods", run: () => compare(!compared) },
     { keys: "V", group: "Looking", label: "Frame, both, 3-D", run: nextStage },
     { keys: "Z", group: "Looking", label: "Loupe", run: () => view.toggleLoupe() },
     ...paneKeys([view.pane]),
@@ -317,9 +316,18 @@ function chooseMethod(wanted) {
 
 /** @param {boolean} on */
 function compare(on) {
-  compared = compareSwitch.checked = on;
+  compared = compareSwitch.checked = on && results.methods.length > 1;
+  if (on && !compared) return tellOtherMethod();
   setView({ compare: on ? "1" : null });
   void loadHistories().catch(toastError);
+}
+
+/** Comparing takes two measurements of the video. */
+function tellOtherMethod() {
+  const other = METHODS.find(({ value }) => !results.methods.includes(value))?.name ?? "other";
+  toast(`Only one method has measured this video. Choose ${other} on the Track page and measure; both are kept.`, {
+    action: { label: "Go to Track", run: () => location.assign(stepUrl(page.id, "track")) },
+  });
 }
 
 /** @param {Stage} wanted */
