@@ -21,6 +21,7 @@ from core.intervals import within
 from core.lens import Lens, read_lens, require_image_size
 from core.progress import Progress, silent
 from core.project import LINE_NAMES, PROJECT_FILE, Band, Lines, Project, Target, project_problems, read_project
+from core.storage import File, file_at
 from core.validation import read_gps
 from core.video import FrameIndex, VideoInfo, frame_index, probe
 
@@ -81,7 +82,7 @@ def _read_inputs(
             return None
 
     given = project.inputs
-    video = folder / given.video
+    video = file_at(folder, given.video)
     info = tried(probe, video)
     index = tried(frame_index, video) if info else None
     lens = tried(read_lens, folder / given.lens) if given.lens else None
@@ -96,7 +97,7 @@ def _read_inputs(
     return _Inputs(info=info, index=index, lens=lens, cloud=cloud, reference=reference)
 
 
-def _require_lens_of_video(lens: Lens, lens_file: Path, info: VideoInfo, video: Path) -> None:
+def _require_lens_of_video(lens: Lens, lens_file: Path, info: VideoInfo, video: File) -> None:
     require_image_size(lens, width=info.width, height=info.height, lens_file=lens_file, video_file=video)
 
 

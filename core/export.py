@@ -38,6 +38,7 @@ from core.results import (
 from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution
 from core.solve import filtered
+from core.storage import File
 from core.validation import GpsComparison, GpsRecord, compare_with_gps
 from core.video import read_frame
 
@@ -84,7 +85,7 @@ class Results:
     recording: Recording
     solution: Solution
     gps: GpsRecord | None
-    video: Path
+    video: File
     sha256: Mapping[str, str]
     version: str
     frames_measured: int

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from core.coordinates import Floats, read_only
 from core.errors import InputError
 from core.project import write_atomically
+from core.storage import File
 
 # Newton's method doubles the number of right digits: after a step this small the ray is exact in float64.
 _LAST_STEP = 1e-9
@@ -201,7 +202,7 @@ class Lens:
         return (d * off_x - b * off_y) / determinant, (a * off_y - b * off_x) / determinant
 
 
-def require_image_size(lens: Lens, *, width: int, height: int, lens_file: Path | str, video_file: Path | str) -> None:
+def require_image_size(lens: Lens, *, width: int, height: int, lens_file: Path | str, video_file: File | str) -> None:
     """Refuse a lens calibrated for frames of another size than the video's.
 
     Raises:

@@ -7,7 +7,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from core.following import Apparent
 from core.lens import Lens
 from core.measurements import FrameMeasurement, Reference
 from core.project import Method, Target
+from core.storage import File, opened, state_of
 
 # Raised whenever the same video would be measured differently: older recordings are then not continued.
 MEASURE_VERSION = 2
@@ -33,7 +33,7 @@ class MeasureSetup:
         origin_m: (2,) of the local plan.
     """
 
-    video: Path
+    video: File
     reference_frame: int
     moving_regions_px: tuple[tuple[tuple[float, float], ...], ...]
     targets: tuple[Target, ...]
@@ -58,12 +58,12 @@ class MeasureSetup:
         return digest.hexdigest()
 
 
-def video_identity(video: Path) -> str:
+def video_identity(video: File) -> str:
     """Return a name for a video's content from its size and samples of its bytes; quick for any size."""
     try:
-        size = video.stat().st_size
+        size = state_of(video).size
         digest = hashlib.sha256(str(size).encode())
-        with video.open("rb") as stream:
+        with opened(video) as stream:
             for place in sorted({0, max(0, size // 2), max(0, size - SAMPLE_BYTES)}):
                 stream.seek(place)
                 digest.update(stream.read(SAMPLE_BYTES))

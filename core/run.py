@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from core.relief import Relief, rasterise
 from core.solution import Solution
 from core.solve import solve
 from core.solve_geometric import fit_with_relief
+from core.storage import File, file_at, opened, state_of
 from core.validation import GpsRecord, read_gps
 from core.video import VideoInfo, frame_index, probe
 
@@ -52,7 +53,7 @@ class LoadedInputs:
 
     folder: Path
     project: Project
-    video: Path
+    video: File
     info: VideoInfo
     lens: Lens
     has_lens: bool
@@ -138,7 +139,7 @@ def run_project(
             solution=solution,
             gps=inputs.gps,
             video=inputs.video,
-            sha256={file: sha256_of(folder / file, results) for file in input_files(inputs.project)},
+            sha256={file: sha256_of(file_at(folder, file), results) for file in input_files(inputs.project)},
             version=program_version(),
             frames_measured=new,
             measuring_s=measured_s,
@@ -156,9 +157,9 @@ def load_inputs(folder: Path, progress: Progress = silent) -> LoadedInputs:
         InputError: something is missing, malformed or does not fit together.
     """
     project = read_project(folder)
-    video = folder / project.inputs.video
+    video = file_at(folder, project.inputs.video)
     info = probe(video)
-    lens = _lens_of(folder, project, info)
+    lens = _lens_of(folder, project, video, info)
     gps = project.inputs.gps
     return LoadedInputs(
         folder=folder,
@@ -172,14 +173,12 @@ def load_inputs(folder: Path, progress: Progress = silent) -> LoadedInputs:
     )
 
 
-def _lens_of(folder: Path, project: Project, info: VideoInfo) -> Lens | None:
+def _lens_of(folder: Path, project: Project, video: File, info: VideoInfo) -> Lens | None:
     if project.inputs.lens is None:
         return None
     file = folder / project.inputs.lens
     lens = read_lens(file)
-    require_image_size(
-        lens, width=info.width, height=info.height, lens_file=file, video_file=folder / project.inputs.video
-    )
+    require_image_size(lens, width=info.width, height=info.height, lens_file=file, video_file=video)
     return lens
 
 
@@ -333,20 +332,27 @@ def input_files(project: Project) -> list[str]:
     return [file for file in files if file is not None]
 
 
-def sha256_of(file: Path, results: Path) -> str:
+def sha256_of(file: File, results: Path) -> str:
     """Return a file's SHA-256; that of a large file is kept in `results` while its size and time stay."""
-    state = file.stat()
+    state = state_of(file)
     known_file = results / "sha256.json"
     try:
         known = json.loads(known_file.read_text())
     except (OSError, ValueError):
         known = {}
-    key = f"{file.name} {state.st_size} {state.st_mtime_ns}"
+    key = f"{file.name} {state.size} {state.version}"
     if key not in known:
-        with file.open("rb") as stream:
-            known[key] = hashlib.file_digest(stream, "sha256").hexdigest()
+        with opened(file) as stream:
+            known[key] = _digest(stream)
         write_atomically(known_file, json.dumps(known, indent=1).encode())
     return str(known[key])
+
+
+def _digest(stream: BinaryIO) -> str:
+    digest = hashlib.sha256()
+    while block := stream.read(1 << 20):
+        digest.update(block)
+    return digest.hexdigest()
 
 
 def program_version() -> str:

@@ -10,10 +10,11 @@ import os
 import queue
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import BinaryIO
 
 import av
 import numpy as np
@@ -23,6 +24,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from core.errors import InputError
+from core.storage import File, FileState, opened, state_of
 
 Luma = NDArray[np.uint8]
 # Frames decoded ahead of the one being measured: enough to keep the decoder busy, 12 MB each at 4K.
@@ -81,24 +83,30 @@ class FrameIndex:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+def _opened(path: File) -> Iterator[tuple[InputContainer, VideoStream]]:
+    with ExitStack() as stack:
+        # FFmpeg opens what lies on this machine itself.
+        source = str(path) if isinstance(path, Path) else stack.enter_context(opened(path))
+        container = stack.enter_context(_container(path, source))
+        if not container.streams.video:
+            raise InputError(f"{path}: holds no video stream; choose the file with the pictures.")
+        yield container, container.streams.video[0]
+
+
+def _container(path: File, source: str | BinaryIO) -> InputContainer:
     try:
-        container = av.open(str(path))
+        return av.open(source, "r")
     except FileNotFoundError:
         raise InputError(f"{path}: not found; correct inputs.video or put the file there.") from None
     except (av.error.FFmpegError, OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be opened as a video ({_reason(error)}); export it again as MP4.") from None
-    with container:
-        if not container.streams.video:
-            raise InputError(f"{path}: holds no video stream; choose the file with the pictures.")
-        yield container, container.streams.video[0]
 
 
 def _reason(error: Exception) -> str:
     return str(getattr(error, "strerror", None) or error)
 
 
-def probe(path: Path) -> VideoInfo:
+def probe(path: File) -> VideoInfo:
     """Return what the container and its first frame say, without reading the rest.
 
     Raises:
@@ -130,21 +138,21 @@ def _duration_s(container: InputContainer, stream: VideoStream) -> float:
     return float(container.duration or 0) / av.time_base
 
 
-def frame_index(path: Path) -> FrameIndex:
+def frame_index(path: File) -> FrameIndex:
     """Return the index of all presented frames, read from the packets without decoding; kept while the file stays.
 
     Raises:
         InputError: as `probe`.
     """
     try:
-        state = path.stat()
+        state = state_of(path)
     except OSError:
         raise InputError(f"{path}: not found; correct inputs.video or put the file there.") from None
-    return _frame_index(path.resolve(), state.st_size, state.st_mtime_ns)
+    return _frame_index(path.resolve() if isinstance(path, Path) else path, state)
 
 
 @lru_cache(maxsize=16)
-def _frame_index(path: Path, size: int, modified_ns: int) -> FrameIndex:
+def _frame_index(path: File, state: FileState) -> FrameIndex:
     ticks: list[int] = []
     keys: list[int] = []
     with _opened(path) as (container, stream):
@@ -164,7 +172,7 @@ def _frame_index(path: Path, size: int, modified_ns: int) -> FrameIndex:
 
 
 def read_frames(
-    path: Path, start: int = 0, stop: int | None = None, *, threads: int = 0, index: FrameIndex | None = None
+    path: File, start: int = 0, stop: int | None = None, *, threads: int = 0, index: FrameIndex | None = None
 ) -> Iterator[Frame]:
     """Yield frames `start` to `stop` (exclusive; None for all), decoding ahead in a thread of its own.
 
@@ -208,7 +216,7 @@ def read_frames(
         thread.join()
 
 
-def read_frame(path: Path, number: int, *, index: FrameIndex | None = None) -> Frame:
+def read_frame(path: File, number: int, *, index: FrameIndex | None = None) -> Frame:
     """Return one frame by its number.
 
     Args:
@@ -222,7 +230,7 @@ def read_frame(path: Path, number: int, *, index: FrameIndex | None = None) -> F
     raise InputError(f"{path}: has no frame {number}; choose a smaller frame number.")
 
 
-def read_frame_rgb(path: Path, index: int) -> NDArray[np.uint8]:
+def read_frame_rgb(path: File, index: int) -> NDArray[np.uint8]:
     """Return one frame as (height, width, 3) RGB for people to look at.
 
     Raises:
@@ -233,7 +241,7 @@ def read_frame_rgb(path: Path, index: int) -> NDArray[np.uint8]:
     raise InputError(f"{path}: has no frame {index}; choose a smaller frame number.")
 
 
-def read_frames_rgb(path: Path, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+def read_frames_rgb(path: File, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """Yield numbers and pictures of frames from `start` on, each (height, width, 3) RGB upright.
 
     Raises:
@@ -243,7 +251,7 @@ def read_frames_rgb(path: Path, start: int = 0, stop: int | None = None) -> Iter
         yield index, np.ascontiguousarray(np.rot90(picture.to_ndarray(format="rgb24"), picture.rotation // 90))
 
 
-def _decoded(path: Path, start: int, stop: int | None, threads: int, index: FrameIndex | None) -> Iterator[Frame]:
+def _decoded(path: File, start: int, stop: int | None, threads: int, index: FrameIndex | None) -> Iterator[Frame]:
     first_tick: int | None = (index or frame_index(path)).ticks[0] if start > 0 else None
     for picture, number in _pictures(path, start, stop, threads, index):
         if first_tick is None:
@@ -253,7 +261,7 @@ def _decoded(path: Path, start: int, stop: int | None, threads: int, index: Fram
 
 
 def _pictures(
-    path: Path, start: int, stop: int | None, threads: int, index: FrameIndex | None
+    path: File, start: int, stop: int | None, threads: int, index: FrameIndex | None
 ) -> Iterator[tuple[VideoFrame, int]]:
     """Yield decoded pictures with their frame numbers; numbers after a seek come from the timestamps alone."""
     with _opened(path) as (container, stream):
@@ -285,7 +293,7 @@ def _until_damaged(container: InputContainer, stream: VideoStream) -> Iterator[V
 
 
 def _seek(
-    container: InputContainer, stream: VideoStream, path: Path, start: int, index: FrameIndex | None
+    container: InputContainer, stream: VideoStream, path: File, start: int, index: FrameIndex | None
 ) -> dict[int, int]:
     """Go to the last key frame at or before frame `start`; return the frame number of every timestamp."""
     index = index or frame_index(path)

@@ -28,9 +28,10 @@ import av
 import cv2
 import numpy as np
 
+from core.chunks import Chunk
 from core.following import LinesFollower
 from core.ground import GroundTracker
-from core.measure import Chunk, make_measurer, measure, measure_chunk
+from core.measure import make_measurer, measure, measure_chunk
 from core.measurements import MeasurementStore
 from core.paper import PaperMeasurer
 from core.run import FRAMES_FILE, load_inputs

@@ -17,6 +17,7 @@ ORDER = (
     "errors",
     "progress",
     "coordinates",
+    "storage",
     "intervals",
     "project",
     "video",

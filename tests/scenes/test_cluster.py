@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import signal
 import sqlite3
@@ -16,6 +17,7 @@ import pytest
 
 from app import cli
 from core import cluster as tasks
+from core.project import read_project
 from core.results import read_history_csv
 from core.run import FRAMES_FILE, load_inputs
 from tests.scenes.clips import BRIEF, displacement, measured, measured_history, project_copy, rendered
@@ -115,6 +117,18 @@ def test_a_workspace_is_measured_one_project_after_the_other(clip, sequential, c
         # The file is rounded to micrometres.
         difference_m = np.abs(displacement(history) - displacement(sequential))
         assert float(np.nanmax(difference_m)) < SAME_M
+
+
+def test_workers_read_videos_from_where_they_are_stored(clip, sequential, cluster, tmp_path):
+    address, _ = cluster
+    inputs = read_project(clip).inputs.model_copy(update={"video": (clip / "video.mp4").resolve().as_uri()})
+    folder = project_copy(clip, tmp_path / "clip", inputs=inputs.model_dump())
+    (folder / "video.mp4").unlink()
+    assert cli.main(["run", str(folder), "--scheduler", address]) == 0
+    history = read_history_csv(folder / "results" / "roof.csv")
+    assert float(np.nanmax(np.abs(displacement(history) - displacement(sequential)))) < SAME_M
+    summary = (folder / "results" / "summary.json").read_text()
+    assert hashlib.sha256((clip / "video.mp4").read_bytes()).hexdigest() in summary
 
 
 def test_a_scheduler_that_is_not_there_is_named(clip, tmp_path, capsys):
