@@ -156,7 +156,7 @@ def fit_poses(
 
     Args:
         rays: (F, N, 2) observed, nan where not observed.
-        weight: (F, N) prior weights, 0 where not to be used.
+        weight: (F, N) prior weights: inverse variances in any unit, 0 where not to be used.
         points_m: (N, 3) world.
         start: one pose for all frames, or an earlier fit of the same frames.
         robust: whether to weigh down outliers (Tukey's biweight on a median scale).
@@ -201,14 +201,16 @@ def _fit_batch(
     observed = np.where(seen[..., None], rays, 0.0)
     base = np.where(seen, weight, 0.0)
     used, sigma = base, np.full(len(rays), sigma_floor)
+    root = np.sqrt(base)[..., None]
     for iteration in range(iterations):
         predicted, J = jacobians(R, C, points_m)
         residual = observed - predicted
         if robust:
-            sigma = np.maximum(robust_sigma(residual, seen), sigma_floor)
+            # Of a point that is known to be good, little is already too much.
+            sigma = np.maximum(robust_sigma(root * residual, seen), sigma_floor)
             # A wide funnel first, so that a poor start does not throw good points out.
             funnel = 4.0 if iteration < 2 else 1.0
-            used = base * _tukey(residual, funnel * sigma)
+            used = base * _tukey(root * residual, funnel * sigma)
         A, g = _normal(J[..., :unknowns], residual, used)
         step = _solve_damped(A, g)
         R = exponential(step[:, :3]) @ R

@@ -233,6 +233,7 @@ def summary_of(results: Results, check: GpsCheck | None, warnings: list[str]) ->
         "ground_fit": _ground_summary(solution.ground),
         "self_calibration": _calibration_summary(solution.self_calibration),
         "flight": _flight_summary(solution.flight),
+        "rolling_shutter": None if solution.readout is None else dataclasses.asdict(solution.readout),
         "sha256": dict(results.sha256),
         "settings": results.project.model_dump(mode="json"),
     }
@@ -493,6 +494,13 @@ def _ground_facts(solution: Solution, ground: Mapping[str, Any]) -> list[Fact]:
             for axis, model, kept in zip("xyz", flight.models, kept_m, strict=True)
         ]
         facts.append(Fact("camera position noise, single pose → smooth flight", ", ".join(words)))
+    if solution.readout is not None:
+        facts.append(
+            Fact(
+                "rolling shutter, first to last row",
+                f"{1e3 * solution.readout.readout_s:.1f} ms, {solution.readout.source}",
+            )
+        )
     return facts
 
 
@@ -500,30 +508,22 @@ def _corrections(solution: Solution) -> list[Correction]:
     calibration = solution.self_calibration
     if calibration is None or calibration.refused is not None:
         return []
-    values = _calibrated_values(solution)
     corrections = []
     for parameter, change, sigma, in_priors in zip(
         calibration.parameters, calibration.correction, calibration.sigma, calibration.in_priors, strict=True
     ):
         unit = "" if parameter.unit == "1" else f" {parameter.unit}"
         digits = {"px": 2, "m": 3}.get(parameter.unit, 5)
-        after = values[parameter.name]
+        after = parameter.value + change
         corrections.append(
             Correction(
                 parameter.name,
-                f"{after - change:.{digits}f}{unit}",
+                f"{parameter.value:.{digits}f}{unit}",
                 f"{after:.{digits}f} ± {sigma:.{digits}f}{unit}",
                 float(in_priors),
             )
         )
     return corrections
-
-
-def _calibrated_values(solution: Solution) -> dict[str, float]:
-    """Return each parameter of the self-calibration as it was used."""
-    (fx, fy), (cx, cy), (k1, k2) = solution.lens.focal_px, solution.lens.centre_px, solution.lens.distortion[:2]
-    heights = {f"height of {name}": height for name, height in solution.heights_m.items() if height is not None}
-    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "k1": k1, "k2": k2, **heights}
 
 
 def _calibration_note(calibration: SelfCalibration | None) -> str:
@@ -533,8 +533,8 @@ def _calibration_note(calibration: SelfCalibration | None) -> str:
         return f"Nothing was corrected: {calibration.refused}."
     before, after = 1e3 * calibration.rms_before_m, 1e3 * calibration.rms_after_m
     return (
-        f"From the frames before the event alone. The target's apparent motion there was {before:.2f} mm RMS with the "
-        f"calibration as given, and {after:.2f} mm with these corrections."
+        f"From the frames in which the building stands still, and from the ground. The target's apparent motion there "
+        f"was {before:.2f} mm RMS with the calibration as given, and {after:.2f} mm with these corrections."
     )
 
 

@@ -156,19 +156,54 @@ def fit_reference(
     )
 
 
-def reference_pose(pairs: Sequence[Correspondence], lens: Lens, origin_m: Floats, elevation_m: Floats | None) -> Pose:
+def reference_pose(
+    pairs: Sequence[Correspondence],
+    lens: Lens,
+    origin_m: Floats,
+    elevation_m: Floats | None,
+    shift_m: Floats | None = None,
+) -> Pose:
     """Return the reference frame's pose alone, for lenses that differ a little from one that has been fitted.
 
     Args:
         origin_m: (2,) local origin the pose is relative to.
         elevation_m: as in `fit_reference`.
+        shift_m: (3,) by which the camera's centre is taken to lie beside the fit; the rotation then follows the clicks.
     """
+    rays, points = _enabled_clicks(pairs, lens, origin_m, elevation_m)
+    start = pose_from_homography(invert_homography(_linear_homography(rays, points[:, :2])))
+    pose = _pose(rays, points, start)
+    if shift_m is None or not np.any(shift_m):
+        return pose
+    centre = (pose.centre_m + shift_m)[None]
+    turned = fit_poses(rays[None], np.ones((1, len(rays))), points, pose, robust=False, fixed_centre_m=centre)
+    return Pose(turned.R[0], turned.centre_m[0])
+
+
+def reference_centre_sigma(fit: ReferenceFit, pairs: Sequence[Correspondence], elevation_m: Floats | None) -> Floats:
+    """Return how well the clicks fix the camera's centre, (3,) metres, one standard deviation.
+
+    A camera a little to the side that looks a little slanted sees nearly the same ground: the clicks tell the two
+    apart by perspective alone.
+    """
+    assert fit.pose is not None
+    rays, points = _enabled_clicks(pairs, fit.lens, fit.origin_m, elevation_m)
+    at_clicks = fit_poses(rays[None], np.ones((1, len(rays))), points, fit.pose, iterations=1, robust=False)
+    freedom = max(2 * len(rays) - 6, 1)
+    variance = float((at_clicks.residual**2).sum()) / freedom
+    covariance = variance * np.linalg.pinv(at_clicks.normal[0], hermitian=True)
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0)))
+
+
+def _enabled_clicks(
+    pairs: Sequence[Correspondence], lens: Lens, origin_m: Floats, elevation_m: Floats | None
+) -> tuple[Floats, Floats]:
+    """Return rays (N, 2) and local world points (N, 3) of the enabled pairs."""
     enabled = np.array([pair.enabled for pair in pairs], dtype=bool)
     ground = np.array([pair.ground_m for pair in pairs])[enabled] - origin_m
-    rays = lens.rays_from_raw(np.array([pair.frame_px for pair in pairs])[enabled])
     height = np.zeros(len(ground)) if elevation_m is None else np.nan_to_num(elevation_m)[enabled]
-    start = pose_from_homography(invert_homography(_linear_homography(rays, ground)))
-    return _pose(rays, np.column_stack([ground, height]), start)
+    rays = lens.rays_from_raw(np.array([pair.frame_px for pair in pairs])[enabled])
+    return rays, np.column_stack([ground, height])
 
 
 def check_pairs(pairs: Sequence[Correspondence]) -> None:

@@ -12,7 +12,7 @@ import time
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +78,17 @@ class Recording:
     H_ray_ray0: Floats
     ground_raw: Floats
     targets_raw: Mapping[str, Floats]
+
+    def selected(self, chosen: NDArray[np.int64]) -> Recording:
+        """Return some of the frames, by their place (M,) in these arrays."""
+        return replace(
+            self,
+            frame=self.frame[chosen],
+            time_s=self.time_s[chosen],
+            H_ray_ray0=self.H_ray_ray0[chosen],
+            ground_raw=self.ground_raw[chosen],
+            targets_raw={name: raw[chosen] for name, raw in self.targets_raw.items()},
+        )
 
 
 class MeasurementStore:

@@ -18,6 +18,7 @@ from core.coordinates import Floats, invert_homography
 from core.errors import InputError
 from core.export import Results, write_results
 from core.georeference import ReferenceFit
+from core.ground_poses import fit_with_relief
 from core.intervals import within
 from core.lens import Lens, read_lens, require_image_size
 from core.measure import measure
@@ -29,7 +30,6 @@ from core.project import Project, read_project, write_atomically
 from core.relief import Relief, rasterise
 from core.solution import Solution
 from core.solve import solve
-from core.solve_geometric import fit_with_relief
 from core.storage import File, file_at, opened, state_of
 from core.validation import GpsRecord, read_gps
 from core.video import VideoInfo, frame_index, probe

@@ -11,21 +11,27 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from core.coordinates import Floats
+from core.coordinates import Bools, Floats, finite_median
 
 # Corrections beyond this many priors mean that something else is wrong: another lens, another height.
 SUSPICIOUS = 3.0
-ITERATIONS = 5
+ITERATIONS = 6
+# Steps for which derivatives are taken anew: the relation is all but straight.
+LINEARISED = 3
+# Steps after which the noise of the stationary part is, at least, what then remains of it.
+INFLATING = 2
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One quantity that may be corrected: its name, unit, and the standard deviation of its calibration."""
+    """One quantity that may be corrected: its name, unit, the standard deviation of its calibration, and its value."""
 
     name: str
     unit: str
     sigma: float
+    value: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -70,48 +76,64 @@ def self_calibrate(
     apparent_motion: Callable[[Floats], Floats],
     sigma_m: Floats,
     ground_misfit: Callable[[Floats], Floats] | None = None,
+    *,
+    part: NDArray[np.int64] | None = None,
 ) -> SelfCalibration:
     """Return the corrections under which the target stands still.
 
     Args:
         apparent_motion: leads from corrections (P,) to the target's coordinates (B, K) in B stationary moments, metres.
-        sigma_m: (B, K) noise of these coordinates; nan where a moment is not to be used.
+        sigma_m: (B, K) noise of these coordinates; nan where a moment is not to be used. Where the target stands less
+            still than that under the best calibration, the noise is what it still moves by.
         ground_misfit: leads from corrections to what the ground leaves over in the whole clip, in units of its noise:
             the ground never moves, so a wrong lens shows wherever the view has turned far.
+        part: (B,) which moments share one resting place, before the event or after it; all where None.
 
     Source: Gauss-Newton on the posterior; the priors make it a ridge regression with meaning.
     """
     priors = np.array([parameter.sigma for parameter in parameters])
     usable = np.isfinite(sigma_m)
+    weight = np.where(usable, 1.0 / np.where(usable, sigma_m, 1.0) ** 2, 0.0)
+    same = np.zeros(len(sigma_m), dtype=np.int64) if part is None else part
+    together = (same[:, None] == same).astype(np.float64)
+
+    def departure(scaled: Floats) -> Floats:
+        motion = apparent_motion(scaled * priors)
+        w = np.where(np.isfinite(motion), weight, 0.0)
+        rest = together @ (w * np.nan_to_num(motion)) / np.maximum(together @ w, 1e-300)
+        return np.where(w > 0, motion - rest, 0.0) * np.sqrt(w)
 
     def misfit(scaled: Floats) -> Floats:
-        motion = apparent_motion(scaled * priors)
-        still = usable & np.isfinite(motion)
-        weight = np.where(still, 1.0 / np.where(usable, sigma_m, 1.0) ** 2, 0.0)
-        rest = (weight * np.nan_to_num(motion)).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
-        own = (np.where(still, motion - rest, 0.0) / np.where(usable, sigma_m, 1.0)).ravel()
+        own = departure(scaled).ravel()
         return own if ground_misfit is None else np.concatenate([own, ground_misfit(scaled * priors)])
 
     scaled = np.zeros(len(priors))
-    before = misfit(scaled)
-    residual, J = before, np.zeros((before.size, len(priors)))
-    for _ in range(ITERATIONS):
-        J = _derivatives(misfit, scaled, residual)
-        weight = _huber(residual)
-        normal = (J * weight[:, None]).T @ J + np.eye(len(priors))
-        step = np.linalg.solve(normal, -(J * weight[:, None]).T @ residual - scaled)
+    residual = misfit(scaled)
+    before, J = residual[: sigma_m.size], np.empty((residual.size, len(priors)))
+    scale = np.ones((residual.size, 1))
+    for iteration in range(ITERATIONS):
+        if iteration < LINEARISED:
+            J = _derivatives(misfit, scaled, residual)
+        relative, slope = residual[:, None] / scale, J / scale
+        huber = _huber(relative)
+        step = np.linalg.solve(
+            (huber * slope).T @ slope + np.eye(len(priors)), -((huber * slope).T @ relative)[:, 0] - scaled
+        )
         scaled = scaled + step
         residual = misfit(scaled)
-        if np.abs(step).max() < 1e-3:
+        if iteration < INFLATING:
+            spread = _spread(residual[: sigma_m.size].reshape(sigma_m.shape), usable)
+            scale[: sigma_m.size, 0] = np.tile(np.maximum(1.0, spread), len(sigma_m))
+        elif np.abs(step).max() < 1e-3:
             break
-    covariance: Floats = np.asarray(np.linalg.inv(J.T @ J + np.eye(len(priors))) * np.outer(priors, priors))
-    scale = np.where(usable, sigma_m, np.nan).ravel()
+    slope = J / scale
+    covariance: Floats = np.asarray(np.linalg.inv(slope.T @ slope + np.eye(len(priors))) * np.outer(priors, priors))
     return SelfCalibration(
         parameters=parameters,
         correction=scaled * priors,
         sigma=np.sqrt(np.diag(covariance)),
-        rms_before_m=float(np.sqrt(np.nanmean((before[: scale.size] * scale) ** 2))),
-        rms_after_m=float(np.sqrt(np.nanmean((residual[: scale.size] * scale) ** 2))),
+        rms_before_m=float(np.sqrt(np.nanmean((before.reshape(sigma_m.shape) * sigma_m) ** 2))),
+        rms_after_m=float(np.sqrt(np.nanmean((residual[: sigma_m.size].reshape(sigma_m.shape) * sigma_m) ** 2))),
         covariance=covariance,
     )
 
@@ -126,6 +148,12 @@ def _derivatives(misfit: Callable[[Floats], Floats], at: Floats, value: Floats) 
     """Return the derivatives (n, P) by forward differences of a fifth of a prior: far above rounding, and straight."""
     step = 0.2
     return np.stack([(misfit(at + step * unit) - value) / step for unit in np.eye(len(at))], axis=1)
+
+
+def _spread(own: Floats, usable: Bools) -> Floats:
+    """Return the robust standard deviation (K,) of residuals (B, K) where they are used; 1 where none is."""
+    spread = 1.4826 * finite_median(np.where(usable, np.abs(own), np.nan).T)
+    return np.where(usable.any(axis=0), spread, 1.0)
 
 
 def _huber(residual: Floats) -> Floats:

@@ -16,6 +16,7 @@ from core.lens import Lens
 from core.measurements import Recording
 from core.project import Project
 from core.results import Status, TargetHistory
+from core.row_times import Readout
 from core.self_calibration import SelfCalibration
 
 
@@ -77,7 +78,7 @@ class Solution:
         ground: every frame's geometry and its quality.
         targets: by name.
         histories: what is exported: relative motion taken, drift filtered.
-        self_calibration, flight: reports; None where they do not apply.
+        self_calibration, flight, readout: reports; None where they do not apply.
         warnings: sentences for people.
     """
 
@@ -89,6 +90,7 @@ class Solution:
     histories: Mapping[str, TargetHistory]
     self_calibration: SelfCalibration | None
     flight: SmoothFlight | None
+    readout: Readout | None
     warnings: tuple[str, ...]
 
 

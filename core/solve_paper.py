@@ -12,6 +12,7 @@ from core.coordinates import Bools, Floats, apply_homography, finite_rows
 from core.errors import InputError
 from core.georeference import ReferenceFit
 from core.ground import LEAST_POINTS, fit_homography
+from core.ground_poses import fit_with_relief
 from core.lens import Lens
 from core.measurements import Recording
 from core.motion import regress_lines
@@ -19,7 +20,6 @@ from core.project import Project, Target
 from core.relief import Relief
 from core.results import TargetHistory
 from core.solution import Ground, Solution, TargetSolution, frame_status
-from core.solve_geometric import fit_with_relief
 
 
 def solve_paper(
@@ -45,6 +45,7 @@ def solve_paper(
         targets=targets,
         histories={name: solved.history for name, solved in targets.items()},
         self_calibration=None,
+        readout=None,
         flight=None,
         warnings=(),
     )

@@ -9,12 +9,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
-from core.coordinates import Bools, Floats
+from core.coordinates import Bools, Floats, finite_median
 
-# Part of their scatter that neighbouring points share, and roof and ground do not (measured on H.264 clips of 16 to
-# 45 Mbit/s: 0.03 px of 0.07 to 0.1 px).
-SHARED_PART = 0.3
+# What the ground errs by as a whole, as part of its features' scatter (measured on H.264 clips with exact truth).
+GROUND_PART = 0.05
+# Pieces of a strip, each a few blocks of the compression long, and the time over which their wandering is averaged.
+PIECES = 8
+AVERAGED_S = 1.0
+# How much faster the error of a whole target grows than the wandering of its pieces (measured likewise), and the least
+# wandering that is believed, as part of the usual one.
+GROWTH = 1.5
+LEAST_WANDERING = 0.7
 # Stationary frames from which the scatter at rest is believed.
 LEAST_STILL = 30
 # Bounds of the correction by the scatter at rest: beyond them something other than random error is at work.
@@ -27,6 +34,36 @@ class Sigma:
 
     places_m: Floats
     rotation_rad: Floats
+
+
+def common_error(residual: Floats, time_s: Floats, still: Bools) -> Floats:
+    """Return what a target errs by as a whole, (F,) in the residuals' unit, as its disagreement with itself tells.
+
+    Compression redraws a moving roof in every frame, and one standing still less and less. An error of the whole roof
+    cannot be seen; but the pieces of its strips then also wander against each other, though less than they err alike.
+
+    Args:
+        residual: (F, L, K) of lines or (F, N, 2) of points, nan where not observed.
+        time_s: (F,).
+        still: (F,) frames of the stationary part, which say what is usual; all frames if there are few.
+    """
+    frames, rows, count = residual.shape
+    usual = still if still.sum() >= LEAST_STILL else np.ones(frames, dtype=bool)
+    own = residual - finite_median(np.moveaxis(np.where(usual[:, None, None], residual, np.nan), 0, -1))
+    if count % PIECES == 0:
+        own = _mean_seen(own.reshape(frames, rows, PIECES, count // PIECES))
+    square = finite_median(np.abs(own).reshape(frames, -1)) ** 2
+    window = max(1, round(AVERAGED_S / float(np.median(np.diff(time_s))))) if frames > 1 else 1
+    wandering = 1.4826 * np.sqrt(uniform_filter1d(square, window, mode="nearest"))
+    at_rest = max(float(np.median(wandering[usual])), 1e-12)
+    return np.asarray(at_rest * np.maximum(wandering / at_rest, LEAST_WANDERING) ** GROWTH)
+
+
+def _mean_seen(values: Floats) -> Floats:
+    """Return the mean along the last axis where at least half is finite, else nan."""
+    count = np.isfinite(values).sum(axis=-1)
+    mean = np.nansum(values, axis=-1) / np.maximum(count, 1)
+    return np.where(2 * count >= values.shape[-1], mean, np.nan)
 
 
 def combined_sigma(
@@ -44,7 +81,7 @@ def combined_sigma(
     Args:
         points: as the scatter of the target's own points propagates.
         camera_m: (F, 2) what the noise left in the camera's path moves the target by.
-        shared_m: (F,) what neighbouring pixels err by alike, at the target.
+        shared_m: (F,) what ground and target err by as a whole.
         slow_m: (F, 2, 2) what the uncertainty of the calibration moves P1 and P2 by, from rest, as the camera drifts.
         places_m: (F, 2, 2) displacements and rotation_rad (F,) whose scatter at rest is looked at.
         still: (F,) measured frames of the stationary part.

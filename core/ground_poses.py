@@ -1,0 +1,78 @@
+"""The camera's pose in every frame, from ground features that the reference frame ties to the surveyed ground."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from core.camera import Pose, PoseFit, fit_poses, intersect_height, plan_homographies
+from core.coordinates import Floats, finite_median, finite_rows
+from core.georeference import ReferenceFit, fit_reference
+from core.lens import Lens
+from core.measurements import Recording
+from core.project import Project
+from core.relief import Relief
+from core.solution import Ground
+
+# Ground points a frame needs; below half of the usual number it is weak.
+LEAST_GROUND = 20
+# No ground feature is believed to be steadier than this part of the usual one.
+LEAST_SCATTER = 0.3
+# Least scatter of ground points at which outliers are told, pixels.
+LEAST_SIGMA_PX = 0.01
+
+
+def click_elevation(project: Project, relief: Relief | None) -> Floats | None:
+    """Return how far the ground lies above the datum at each click (N,), or None where it is not known."""
+    if relief is None or not project.correspondences:
+        return None
+    return relief.at(np.array([pair.ground_m for pair in project.correspondences]))
+
+
+def fit_with_relief(project: Project, lens: Lens, relief: Relief | None, *, has_lens: bool = True) -> ReferenceFit:
+    """Return the reference fit of the project's clicks, with the ground's own elevation below them where known."""
+    elevation = click_elevation(project, relief)
+    return fit_reference(project.correspondences, lens, has_lens=has_lens, elevation_m=elevation)
+
+
+def ground_points(raw: Floats, lens: Lens, pose0: Pose, origin_m: Floats, relief: Relief | None) -> Floats:
+    """Return the world coordinates (N, 3) of ground features seen at raw reference pixels (N, 2)."""
+    rays = lens.rays_from_raw(raw)
+    xy = intersect_height(pose0.R, pose0.centre_m, rays, 0.0)
+    z = np.zeros(len(xy))
+    for _ in range(2 if relief is not None else 0):
+        assert relief is not None
+        z = relief.at(xy + origin_m)
+        xy = intersect_height(pose0.R, pose0.centre_m, rays, z)
+    return np.column_stack([xy, z])
+
+
+def solve_ground(recording: Recording, lens: Lens, pose0: Pose, origin_m: Floats, relief: Relief | None) -> Ground:
+    """Return the pose of every frame from the ground features."""
+    points = ground_points(recording.reference.ground_raw, lens, pose0, origin_m, relief)
+    rays = lens.rays_from_raw(recording.ground_raw)
+    weight = np.isfinite(points).all(axis=1) * np.ones(len(rays))[:, None]
+    focal = float(lens.focal_px.mean())
+    least = LEAST_SIGMA_PX / focal
+    poses = fit_poses(rays, weight, np.nan_to_num(points), pose0, sigma_floor=least)
+    trusted = weight * _trust(poses)
+    poses = fit_poses(rays, trusted, np.nan_to_num(points), poses, iterations=4, sigma_floor=least)
+    agreeing = np.where(trusted > 0, poses.weight / np.maximum(trusted, 1e-300), 0.0)
+    inlier = agreeing > 0.1
+    squared = np.where(inlier, (np.nan_to_num(poses.residual) ** 2).sum(axis=-1), 0.0)
+    count = inlier.sum(axis=1)
+    rms = np.sqrt(squared.sum(axis=1) / np.maximum(2 * count, 1)) * focal
+    usable = (count >= LEAST_GROUND) & np.isfinite(poses.centre_m).all(axis=1) & (poses.centre_m[:, 2] > 0)
+    return Ground(points, agreeing, plan_homographies(poses.R, poses.centre_m), poses, rms, count, usable)
+
+
+def _trust(poses: PoseFit) -> Floats:
+    """Return the relative weight (N,) of ground features from how steadily each agrees with all others.
+
+    One corner keeps its place to a thirtieth of a pixel in all frames, another, on grass, to half a pixel.
+    """
+    residual = np.where(finite_rows(poses.residual)[..., None], poses.residual, np.nan)
+    own = residual - finite_median(np.moveaxis(residual, 0, -1))
+    sigma = 1.4826 * finite_median(np.moveaxis(np.abs(own), 1, 0).reshape(residual.shape[1], -1))
+    known = sigma > 0
+    usual = float(np.median(sigma[known])) if known.any() else 1.0
+    return np.where(known, (usual / np.maximum(sigma, LEAST_SCATTER * usual)) ** 2, 0.0)
