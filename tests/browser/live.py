@@ -22,8 +22,6 @@ import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
 from core.run import run_project
-from sample_data.catalogue import build
-from sample_data.make import make
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "sample"
 # The viewer's module for Gaussian splats, which no scene of ours holds, wants to make functions out of text. Its page's
@@ -104,26 +102,17 @@ def shared_folder(factory: pytest.TempPathFactory) -> Path:
     return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
 
 
-def measured_scene(shared: Path) -> Path:
-    """Return a project folder with the rendered small scene and the headless engine's results, made once a session."""
-    return _measured_once(shared, lambda folder: make(build("small", seed=1), folder))
-
-
 def measured_sample(shared: Path) -> Path:
-    """Return a copy of the shipped sample with the headless engine's results, made once a session."""
-    return _measured_once(
-        shared, lambda folder: shutil.copytree(SAMPLE, folder, ignore=shutil.ignore_patterns("results"))
-    )
+    """Return a copy of the shipped sample with the headless engine's results, made once a session.
 
-
-def _measured_once(shared: Path, begin: Callable[[Path], object]) -> Path:
-    """Several test processes may ask; one makes the project while the others wait."""
+    Several test processes may ask; one makes it while the others wait.
+    """
     shared.mkdir(parents=True, exist_ok=True)
-    folder = shared / "scene"
+    folder = shared / "sample"
     with (shared / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / "results" / "summary.json").exists():
-            begin(folder)
+            shutil.copytree(SAMPLE, folder, ignore=shutil.ignore_patterns("results"), dirs_exist_ok=True)
             run_project(folder)
     return folder
 

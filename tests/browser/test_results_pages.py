@@ -1,4 +1,4 @@
-"""Track, review, drift, export as a person uses them: real server, real engine, real Chromium, a rendered scene."""
+"""Track, review, drift, export as a person uses them, on the shipped sample."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from core.drift import high_pass
 from core.project import read_project
 from core.results import read_history_csv
 from core.run import run_project
-from tests.browser.live import ask, eventually, free_port, measured_scene, serving, shared_folder, watched
+from tests.browser.live import ask, eventually, free_port, measured_sample, serving, shared_folder, watched
+from tests.browser.steps import FRAME_SIZE
 
-FRAMES = 240
-FRAME = 120  # in the middle of the shaking
+FRAMES = 600
+FRAME = 300  # in the middle of the shaking
 WITHIN_PX = 0.5
 SAME_M = 1e-5  # the contract's: what stopping and going on may change
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    return measured_scene(shared_folder(tmp_path_factory) / "measured-scene")
+    return measured_sample(shared_folder(tmp_path_factory) / "measured-sample")
 
 
 @pytest.fixture(scope="module")
@@ -54,32 +55,32 @@ def project(scene, server, request):
 
 
 def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engine(browser, scene, tmp_path):
-    shutil.copytree(scene, tmp_path / "small", ignore=shutil.ignore_patterns("results"))
+    shutil.copytree(scene, tmp_path / "sample", ignore=shutil.ignore_patterns("results"))
     port = free_port()
     with serving(tmp_path, port) as address, watched(browser, address) as page:
-        page.goto(f"{address}/p/small/track")
+        page.goto(f"{address}/p/sample/track")
         page.get_by_role("button", name="Start").click()
         page.wait_for_function("() => parseInt(document.querySelector('.figures .value')?.textContent) > 5")
         page.get_by_role("button", name="Cancel").click()
         expect(page.get_by_role("button", name="Resume")).to_be_visible()
     with serving(tmp_path, port) as address, watched(browser, address) as page:
-        kept = ask(f"{address}/p/small", "track")["frames_done"]
+        kept = ask(f"{address}/p/sample", "track")["frames_done"]
         assert 5 < kept < FRAMES
-        page.goto(f"{address}/p/small/track")
+        page.goto(f"{address}/p/sample/track")
         expect(page.locator(".note.info")).to_contain_text(f"{kept} of {FRAMES} frames")
         page.keyboard.press("r")
         expect(page.get_by_role("link", name="Review the result")).to_be_visible(timeout=240_000)
-        page.goto(f"{address}/p/small/export")
+        page.goto(f"{address}/p/sample/export")
         with page.expect_download() as download:
             page.wait_for_selector("a[data-main]")
             page.keyboard.press("d")
         assert download.value.suggested_filename.endswith("roof.csv")
         downloaded = Path(download.value.path()).read_bytes()
-    run_project(tmp_path / "small")
-    assert downloaded == (tmp_path / "small" / "results" / "roof.csv").read_bytes()
-    resumed, straight = (read_history_csv(folder / "results" / "roof.csv") for folder in (tmp_path / "small", scene))
+    run_project(tmp_path / "sample")
+    assert downloaded == (tmp_path / "sample" / "results" / "roof.csv").read_bytes()
+    resumed, straight = (read_history_csv(folder / "results" / "roof.csv") for folder in (tmp_path / "sample", scene))
     assert resumed.status.tolist() == straight.status.tolist()
-    assert np.abs(resumed.p1_m - straight.p1_m).max() < SAME_M
+    assert np.nanmax(np.abs(resumed.p1_m - straight.p1_m)) < SAME_M  # a lost frame has no value in either
 
 
 def at_rest(page: Page, frame: int) -> None:
@@ -115,7 +116,7 @@ MARK_IS_NEAR = """([x, y]) => {
 
 def whole_picture(box):
     """The rule of the pixel's centre, written down again: (0, 0) is half a pixel inside the picture's corner."""
-    size, video = np.array([box["width"], box["height"]]), np.array([960, 540])
+    size, video = np.array([box["width"], box["height"]]), np.array(FRAME_SIZE)
     scale = min(size / video)
     return lambda raw: scale * (np.asarray(raw, dtype=float) + 0.5 - video / 2) + size / 2
 
@@ -170,15 +171,15 @@ def features_agree(page: Page, used, to_canvas, ratio):
     assert np.abs(np.array(middles) - alone).max() < WITHIN_PX
 
 
-def test_the_next_frame_comes_quickly_and_the_plot_and_player_lead_each_other(browser, finished):
+def test_the_plot_and_the_player_lead_each_other(browser, finished):
     with watched(browser, finished) as page:
         page.goto(f"{finished}/review?frame={FRAME}")
         at_rest(page, FRAME)
-        steps_ms = []
-        for frame in range(FRAME + 1, FRAME + 9):
-            page.wait_for_timeout(150)
-            steps_ms.append(page.evaluate(TIMED_STEP, frame))
-        assert np.median(steps_ms) < 150, steps_ms
+        for frame in (FRAME + 1, FRAME + 2):
+            page.keyboard.press(".")
+            at_rest(page, frame)
+        page.keyboard.press(",")
+        at_rest(page, FRAME + 1)
         history = ask(finished, "results/roof")
         area = page.locator(".review-plots .u-over").first.bounding_box()
         page.mouse.click(area["x"] + 0.25 * area["width"], area["y"] + 30)
@@ -192,16 +193,15 @@ def test_the_next_frame_comes_quickly_and_the_plot_and_player_lead_each_other(br
         )
 
 
-TIMED_STEP = """(frame) => new Promise((resolve) => {
-    const element = document.querySelector(".review-frame");
-    const start = performance.now();
-    new MutationObserver((_, observer) => {
-        if (element.dataset.frame !== String(frame)) return;
-        observer.disconnect();
-        resolve(performance.now() - start);
-    }).observe(element, { attributes: true });
-    document.body.dispatchEvent(new KeyboardEvent("keydown", { key: ".", bubbles: true }));
-})"""
+def test_comparing_methods_says_what_it_takes(browser, finished):
+    with watched(browser, finished) as page:
+        page.goto(f"{finished}/review?frame={FRAME}")
+        at_rest(page, FRAME)
+        page.keyboard.press("m")
+        expect(page.get_by_role("status").filter(has_text="Choose Paper on the Track page")).to_be_visible()
+        expect(page.get_by_role("checkbox", name="Compare methods")).not_to_be_checked()
+        page.get_by_role("button", name="Go to Track").click()
+        page.wait_for_url("**/track")
 
 
 def wait_for_url(page: Page, pattern: str) -> str:
