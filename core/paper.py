@@ -115,7 +115,7 @@ class SiftGround:
         if luma.size > 1.5 * len(expected_raw) * side**2:
             places, descriptors, index = self._seen_in_windows(luma, expected_raw)
         else:
-            places, descriptors = self._detect(luma)
+            places, descriptors = self._detect(luma, _around(luma.shape, expected_raw))
             index = np.arange(len(expected_raw))
         candidates: Any = cKDTree(places).query_ball_point(np.nan_to_num(expected_raw[index], nan=-1e6), NEAR_PX)
         matched = np.full_like(expected_raw, np.nan)
@@ -134,8 +134,9 @@ class SiftGround:
         clear = difference[best] < MOST_DIFFERENCE**2 and (others > difference[best] / RATIO**2).all()
         return best if clear else None
 
-    def _detect(self, picture: Luma) -> tuple[Floats, NDArray[np.float32]]:
-        keypoints, descriptors = self._sift.detectAndCompute(picture, None)
+    def _detect(self, picture: Luma, near: Luma) -> tuple[Floats, NDArray[np.float32]]:
+        """Return the features of a picture where `near` is not zero, and their descriptors; the others get none."""
+        keypoints, descriptors = self._sift.detectAndCompute(picture, near)
         if not keypoints:
             return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
         return np.array([keypoint.pt for keypoint in keypoints]), np.asarray(descriptors, dtype=np.float32)
@@ -149,7 +150,9 @@ class SiftGround:
             return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32), index
         side = 2 * WINDOW_PX
         columns = int(np.ceil(np.sqrt(len(windows))))
-        places, descriptors = self._detect(_mosaic(windows, columns))
+        mosaic = _mosaic(windows, columns)
+        middles = np.stack(np.divmod(np.arange(len(windows)), columns)[::-1], axis=1) * side + WINDOW_PX
+        places, descriptors = self._detect(mosaic, _around(mosaic.shape, middles))
         tile = (places // side).astype(np.int64)
         number = tile[:, 1] * columns + tile[:, 0]
         # Near the seams a feature sees its neighbour in the mosaic, not in the frame.
@@ -174,6 +177,15 @@ def _spread_strongest(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...],
         if len(kept) == count:
             break
     return kept
+
+
+def _around(shape: tuple[int, ...], places: Floats) -> Luma:
+    """Return a mask (height, width) of the pixels no further than `NEAR_PX` from any of the places (N, 2)."""
+    mask: Luma = np.zeros(shape, dtype=np.uint8)
+    reach = int(np.ceil(NEAR_PX)) + 1
+    for u, v in np.rint(places[np.isfinite(places).all(axis=1)]).astype(np.int64).tolist():
+        mask[max(0, v - reach) : max(0, v + reach + 1), max(0, u - reach) : max(0, u + reach + 1)] = 1
+    return mask
 
 
 def _windows(luma: Luma, expected_raw: Floats) -> tuple[list[Luma], Floats, NDArray[np.int64]]:
