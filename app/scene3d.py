@@ -283,7 +283,8 @@ def _guarded_viser(token: str) -> viser.ViserServer:
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     for request in (viser_messages.ShareUrlRequest, viser_messages.ShareUrlDisconnect):
         server._websock_server.unregister_handler(request)
-    server.gui.configure_theme(show_share_button=False, show_logo=False)
+    # Dark in both themes, like the surround of every picture: colours of the cloud and thin lines read better on it.
+    server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=True)
     server.gui.set_panel_label("Scene")
     server.gui.main_panel.minimize()
     server.scene.set_up_direction("+z")

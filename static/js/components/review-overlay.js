@@ -13,7 +13,7 @@ export const LAYERS = [
   { layer: "used", name: "Ground features used", key: "G", colour: "--ground-used", sign: "circle" },
   { layer: "rejected", name: "Ground features rejected", key: "Shift+G", colour: "--ground-rejected", sign: "cross" },
   { layer: "bands", name: "Search bands", key: "B", colour: "--l1", sign: "dashes" },
-  { layer: "edges", name: "Edge points", key: "E", colour: "--mark-selected", sign: "dot" },
+  { layer: "edges", name: "Edge points, patches", key: "E", colour: "--mark-selected", sign: "dot" },
   { layer: "lines", name: "Fitted lines", key: "L", colour: "--l2", sign: "line" },
   { layer: "points", name: "P1 and P2", key: "P", colour: "--corner-point", sign: "mark" },
 ];

@@ -363,7 +363,7 @@ page.events.on("orthoimage", () => void loadPlan());
 showTargets();
 draw();
 await Promise.all([loadFrame(), loadPlan()]);
-const drawn = Object.values(bands.bands).flatMap(cornersOf).map(toPixels);
+const drawn = [...Object.values(bands.bands).flatMap(cornersOf), ...(targets.selected?.region_m ?? [])].map(toPixels);
 if (drawn.length > 0 && planPane.image !== null) planPane.lookAtAll(drawn);
 const outlines = store.project.moving_regions_px.flat();
 if (outlines.length > 0 && framePane.image !== null) framePane.lookAtAll(outlines);
