@@ -17,6 +17,7 @@ import uvicorn
 
 from app.context import Context
 from app.server import create_app
+from core.video import frame_index
 from tests.app.conftest import ADDRESS, WRITE, TestClient
 
 SMALL = "/api/projects/small"
@@ -190,6 +191,36 @@ def test_a_calibration_that_fails_says_why_and_changes_nothing(
     assert job["message"].endswith(".")
     assert client.get(SMALL).json()["revision"] == revision
     assert client.get(f"{SMALL}/lens/report").status_code == 404
+
+
+def test_a_large_video_is_read_through_meanwhile(
+    client: TestClient, context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = threading.Event()
+    publish = context.hub.publish
+
+    def listen(project_id: str, event: str, data: Any) -> None:
+        publish(project_id, event, data)
+        if (project_id, event, data) == ("small", "inputs", {"kind": "video"}):
+            told.set()
+
+    def slowly(path: Path) -> Any:
+        assert asked.wait(timeout=20)
+        return frame_index(path)
+
+    asked = threading.Event()
+    monkeypatch.setattr(context.hub, "publish", listen)
+    monkeypatch.setattr("app.videos._AT_ONCE_BYTES", 0)
+    monkeypatch.setattr("app.videos.frame_index", slowly)
+    before = client.get(f"{SMALL}/inputs").json()["video"]
+    assert (before["width"], before["frames"], before["variable_rate"]) == (160, 40, None)
+    assert client.get(SMALL).json()["problems"] is None  # not looked for before the video is read
+    assert client.get(f"{SMALL}/frames/0.jpg").status_code == 200
+    asked.set()
+    assert told.wait(timeout=20)
+    after = client.get(f"{SMALL}/inputs").json()["video"]
+    assert (after["frames"], after["variable_rate"]) == (40, False)
+    assert client.get(SMALL).json()["problems"] is not None
 
 
 def test_frames_are_shown_raw_undistorted_and_smaller(client: TestClient) -> None:
