@@ -125,12 +125,12 @@ def _look_closer(page: Page) -> None:
     scene = page.frame_locator("iframe")
     notice = scene.get_by_role("button", name="Close").or_(scene.locator(".mantine-Notification-closeButton"))
     if notice.count():
-        notice.first.click()
+        notice.first.dispatch_event("click")  # it may still be sliding in
     box = page.locator("iframe").bounding_box()
     if box is None:
         return
     page.mouse.move(box["x"] + 0.48 * box["width"], box["y"] + 0.62 * box["height"])
-    for _ in range(4):
+    for _ in range(2):
         page.mouse.wheel(0, -240)
         page.wait_for_timeout(700)
 
