@@ -351,3 +351,20 @@ def is_determined(normal: Floats, least_ratio: float = 1e-4) -> NDArray[np.bool_
     values = np.linalg.eigvalsh(normal / (scale[:, :, None] * scale[:, None, :]))
     ratio = values[:, 0] / np.maximum(values[:, -1], 1e-300)
     return np.asarray((ratio > least_ratio) & (np.diagonal(normal, axis1=1, axis2=2) > 0).all(axis=1))
+
+
+def is_determined_as_usual(normal: Floats, least_share: float = 0.1) -> NDArray[np.bool_]:
+    """Return for each normal matrix (F, 3, 3) whether it fixes the motion, and in every direction not too weakly.
+
+    A line of which hardly anything is seen still makes the equations soluble; what they then say along the other lines
+    is worth nothing.
+
+    Args:
+        least_share: of the usual information on the weakest direction.
+    """
+    determined = is_determined(normal)
+    if not determined.any():
+        return determined
+    weakest = np.zeros(len(normal))
+    weakest[determined] = 1.0 / np.linalg.eigvalsh(np.linalg.inv(normal[determined])[:, :2, :2])[:, -1]
+    return np.asarray(determined & (weakest >= least_share * np.median(weakest[determined])))

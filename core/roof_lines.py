@@ -179,21 +179,26 @@ class LineTracker:
         return _Section(along, across, _profiles(luma, along, middle, half, axis), place, axis)
 
     def _locate(self, section: _Section, search: int) -> tuple[float, float]:
-        """Return the strip's offset from its expected place, whole pixels, and its correlation there."""
+        """Return the strip's offset from its expected place, good to a tenth of a pixel, and its correlation there."""
         expected = self.profile.offset_px + self.profile.tilt_px * section.x
         fraction = section.across + expected - np.rint(section.across)
         signature = self.profile.signature
         reach = search + (len(signature) - 1) // 2
-        windows = np.empty((QUARTERS, 2 * reach + 1))
-        for window, part in zip(windows, np.array_split(np.arange(len(section.along)), QUARTERS), strict=True):
-            columns = section.half + round(float(fraction[part].mean())) + np.arange(-reach, reach + 1)
+        windows, rounded = np.empty((QUARTERS, 2 * reach + 1)), np.empty(QUARTERS)
+        for number, part in enumerate(np.array_split(np.arange(len(section.along)), QUARTERS)):
+            middle = float(fraction[part].mean())
+            rounded[number] = round(middle) - middle
+            columns = section.half + round(middle) + np.arange(-reach, reach + 1)
             mean = section.values[part[0] : part[-1] + 1].mean(axis=0)
-            window[:] = mean[np.clip(columns, 0, len(mean) - 1)]
-        score = np.median(_correlations(windows, signature), axis=0)
+            windows[number] = mean[np.clip(columns, 0, len(mean) - 1)]
+        scores = _correlations(windows, signature)
+        score = np.median(scores, axis=0)
         shifts = np.arange(-search, search + 1)
         # Among equals the nearest wins; a look-alike must be clearly better to be preferred.
         best = int(np.argmax(score - 0.1 * (shifts / max(search, 1)) ** 2))
-        return float(shifts[best]), float(score[best])
+        inner = min(max(best, 1), 2 * search - 1)
+        vertex = [np.clip(_vertex(row, inner) - best, -1.0, 1.0) for row in scores]
+        return float(shifts[best] + np.median(vertex + rounded)), float(score[best])
 
     def _edges(self, section: _Section, offset: float) -> Floats:
         """Return both edges (STATIONS, 2, 2) where the response to a derivative of a Gaussian is extreme."""

@@ -43,7 +43,7 @@ class Truth:
     centre_m: Floats
 
 
-def pose(frame: int) -> Pose:
+def pose(frame: float) -> Pose:
     """Return the camera of a frame, relative to `SITE_M`."""
     t = frame / RATE_HZ
     drift = np.array([0.25 * np.sin(0.5 * t), 0.2 * np.sin(0.4 * t + 1), 0.1 * np.sin(0.3 * t)])
@@ -52,7 +52,7 @@ def pose(frame: int) -> Pose:
     return Pose(exponential(shaking + [0.06, -0.03, 0.05]) @ down, np.array([0.7, -1.2, 42.0]) + drift)
 
 
-def motion(frame: int) -> tuple[Floats, float]:
+def motion(frame: float) -> tuple[Floats, float]:
     """Return the roof's shift (2,) and rotation: still for 3 s, shaken for 3 s, then at rest 8 cm further east."""
     t = frame / RATE_HZ
     shaking = float(np.clip(min(t - 3.0, 6.0 - t), 0.0, 1.0))
@@ -72,19 +72,19 @@ def _edges() -> Floats:
     return np.array(lines)
 
 
-def _ground() -> Floats:
+def ground_places() -> Floats:
     """Return (N, 2) places on the ground that no frame hides behind the roof."""
     places = np.random.default_rng(3).uniform((-24.0, -13.0), (24.0, 13.0), (260, 2))
     return places[(np.abs(places - ROOF_M) > (7.0, 5.5)).any(axis=1)]
 
 
-def seen(frame: int, points: Floats) -> Floats:
+def seen(frame: float, points: Floats) -> Floats:
     """Return the raw pixels (..., 2) of places (..., 3) relative to `SITE_M`."""
     camera = pose(frame)
     return LENS.raw_from_rays(project(camera.R, camera.centre_m, points.reshape(-1, 3))).reshape(*points.shape[:-1], 2)
 
 
-def _on_roof(frame: int) -> Floats:
+def on_roof(frame: float) -> Floats:
     shift, angle = motion(frame)
     places = _edges() @ rotation_2d(angle).T + ROOF_M + shift
     return np.concatenate([places, np.full((*places.shape[:-1], 1), HEIGHT_M)], axis=-1)
@@ -116,10 +116,10 @@ def project_document(**changes: Any) -> Project:
 @lru_cache
 def recording(noise_px: float = 0.0, frames: int = FRAMES, names: tuple[str, ...] = ("roof",)) -> Recording:
     """Return what is seen of ground and roof, with normal noise on every coordinate of every frame but the first."""
-    ground = np.column_stack([_ground(), np.zeros(len(_ground()))])
+    ground = np.column_stack([ground_places(), np.zeros(len(ground_places()))])
     noise = np.random.default_rng(5)
     seen_ground = np.array([seen(frame, ground) for frame in range(frames)])
-    seen_roof = np.array([seen(frame, _on_roof(frame)) for frame in range(frames)])
+    seen_roof = np.array([seen(frame, on_roof(frame)) for frame in range(frames)])
     reference = Reference(seen_ground[0], {name: seen_roof[0] for name in names})
     if noise_px:
         seen_ground = seen_ground + noise.normal(scale=noise_px, size=seen_ground.shape)

@@ -6,7 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from core.coordinates import Floats, rotation_2d
-from core.motion import LineSet, biweight, fit_line, is_determined, rigid_from_lines, rigid_from_points
+from core.motion import (
+    LineSet,
+    biweight,
+    fit_line,
+    is_determined,
+    is_determined_as_usual,
+    rigid_from_lines,
+    rigid_from_points,
+    rough_rigid_from_lines,
+)
 
 CENTRE = np.array([3.0, -2.0])
 STATIONS = 40
@@ -199,3 +208,35 @@ def test_biweight_falls_from_one_to_nothing() -> None:
     assert 0.9 < weights[1] < 1.0
     assert 0.0 < weights[2] < 0.1
     assert weights[3:].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_glimpse_of_a_line_determines_nothing() -> None:
+    points = np.stack([stations()] * 6)
+    points[3, 2, 2:] = np.nan  # of T1 two places are left
+    points[4, 0] = np.nan  # L2 does for L1
+    points[5, 2, STATIONS // 2 :] = np.nan
+    normal = rigid_from_lines(points, np.ones(points.shape[:3]), lines()).normal
+    assert is_determined(normal)[3]
+    np.testing.assert_array_equal(is_determined_as_usual(normal), [True, True, True, False, True, True])
+
+
+@given(SHIFTS, st.floats(-0.05, 0.05))
+def test_rough_motion_is_the_exact_one_without_noise(shift: Floats, angle: float) -> None:
+    points = moved(stations(), shift, angle)
+    found = rough_rigid_from_lines(points, lines(), shift + [0.03, -0.02], angle + 2e-3)
+    np.testing.assert_allclose(found.shift[0], shift, atol=1e-4)
+    assert found.rotation_rad[0] == pytest.approx(angle, abs=1e-4)
+
+
+def test_rough_motion_is_not_drawn_away_by_a_few_strangers() -> None:
+    points = moved(stations(), np.array([0.2, 0.1]), 0.01)
+    points[:, ::4] += 0.4
+    points[1, 5:14] = np.nan
+    found = rough_rigid_from_lines(points, lines(), np.array([0.18, 0.12]), 0.0)
+    np.testing.assert_allclose(found.shift[0], [0.2, 0.1], atol=2e-3)
+
+
+def test_rough_motion_along_unseen_lines_is_undetermined() -> None:
+    points = stations().copy()
+    points[2] = np.nan
+    assert not is_determined(rough_rigid_from_lines(points, lines(), np.zeros(2), 0.0).normal)[0]

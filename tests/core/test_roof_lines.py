@@ -199,3 +199,12 @@ def test_a_band_without_two_edges_is_refused(grey: Floats) -> None:
 def test_a_band_beyond_the_reference_frame_is_refused() -> None:
     with pytest.raises(InputError, match=r"roof\.L1 lies outside the reference frame; move it"):
         tracker(ends=DRAWN + [0.0, 500.0])
+
+
+def test_a_narrow_strip_is_found_wherever_it_lies_between_pixels() -> None:
+    followed = tracker(frame(strip(width_px=3.0)), width_px=14.0)
+    for shift in np.arange(-1.0, 1.0, 0.05):
+        moved = (0.0, float(shift))
+        found = followed.find(frame(strip(START + moved, END + moved, width_px=3.0)), moved_by(), search_px=4.0)
+        assert found.measured == STATIONS, f"moved by {shift:.2f} px"
+        assert np.abs(off_line(found, START + moved, END + moved)).max() < 0.04

@@ -1,0 +1,232 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from core.calibration import LAG
+from core.camera import fit_poses
+from core.coordinates import Floats
+from core.ground_poses import fit_with_relief, solve_ground
+from core.lens import Lens
+from core.measurements import Recording
+from core.project import Project
+from core.results import Status, TargetHistory
+from core.solution import Solution
+from core.solve_geometric import solve_geometric
+from tests import exact_scene as scene
+
+NOISE_PX = 0.05
+
+
+def solved(recording: Recording, lens: Lens = scene.LENS, **changes: Any) -> Solution:
+    return solve_geometric(recording, scene.project_document(**changes), lens)
+
+
+def error_m(history: TargetHistory) -> Floats:
+    """(F, 2) of P1, both counted from the mean of the stationary part."""
+    still = history.time_s < 2.9
+    true = scene.truth(len(history.frame)).p1_m
+    return (history.p1_m - history.p1_m[still].mean(axis=0)) - (true - true[still].mean(axis=0))
+
+
+def rms_mm(history: TargetHistory) -> float:
+    return 1e3 * float(np.sqrt(np.nanmean(error_m(history) ** 2)))
+
+
+def corrections(solution: Solution) -> dict[str, float]:
+    found = solution.self_calibration
+    assert found is not None
+    assert found.refused is None
+    return dict(zip([parameter.name for parameter in found.parameters], found.correction.tolist(), strict=True))
+
+
+def seen_later(sample: Callable[[float], Floats], delay_s: Floats, frame: int) -> Floats:
+    """Raw pixels (..., 2) of points, each seen `delay_s` (...) after a frame's time stamp, through three views."""
+    span = max(float(np.abs(delay_s).max()), 1e-9)
+    x = (delay_s / span)[..., None]
+    before, now, after = (sample(frame + share * span * scene.RATE_HZ) for share in (-1, 0, 1))
+    return now + 0.5 * x * (after - before) + 0.5 * x**2 * (after - 2 * now + before)
+
+
+def ground_at(moment: float) -> Floats:
+    places = scene.ground_places()
+    return scene.seen(moment, np.column_stack([places, np.zeros(len(places))]))
+
+
+def roof_at(moment: float) -> Floats:
+    return scene.seen(moment, scene.on_roof(moment))
+
+
+def row_delay_s(raw: Floats, readout_s: float) -> Floats:
+    height = scene.SIZE[1]
+    return readout_s * (raw[..., 1] - (height - 1) / 2) / (height - 1)
+
+
+# --- exact -----------------------------------------------------------------------------------------------------------
+
+
+def test_exact_measurements_give_exact_displacement() -> None:
+    solution = solved(scene.recording())
+    assert rms_mm(solution.histories["roof"]) < 0.02
+    assert (solution.histories["roof"].status == Status.OK).all()
+
+
+def test_residual_displacement_stays() -> None:
+    history = solved(scene.recording(NOISE_PX)).histories["roof"]
+    rest = history.p1_m[history.time_s > 6.5].mean(axis=0)
+    np.testing.assert_allclose(rest, [scene.RESIDUAL_M, 0.0], atol=1.5e-3)
+
+
+# --- steady features count more --------------------------------------------------------------------------------------
+
+
+def test_features_on_grass_hardly_count() -> None:
+    recording = scene.recording(0.02)
+    noise = np.random.default_rng(2).normal(scale=0.5, size=recording.ground_raw.shape)
+    grass = np.arange(recording.ground_raw.shape[1]) % 5 < 2
+    noise[:, ~grass] = 0.0
+    rough = replace(recording, ground_raw=recording.ground_raw + noise)
+    project = scene.project_document()
+    reference = fit_with_relief(project, scene.LENS, None)
+    assert reference.pose is not None
+    ground = solve_ground(rough, scene.LENS, reference.pose, reference.origin_m, None)
+    weight = ground.known_poses.weight
+    assert weight[:, grass].mean() < 0.05 * weight[:, ~grass].mean()
+    # They are not outliers for that: what a person is shown as rejected is what disagrees for its own standards.
+    assert (ground.weight[:, grass] > 0.1).mean() > 0.9
+    alone = solve_ground(recording, scene.LENS, reference.pose, reference.origin_m, None)
+    apart = np.abs(ground.known_poses.centre_m - alone.known_poses.centre_m).mean()
+    assert apart < 0.3 * _equally_weighted_error(rough, alone.known_poses.centre_m, project)
+
+
+def _equally_weighted_error(recording: Recording, centre_m: Floats, project: Project) -> float:
+    reference = fit_with_relief(project, scene.LENS, None)
+    assert reference.pose is not None
+    ground = solve_ground(recording, scene.LENS, reference.pose, reference.origin_m, None)
+    rays = scene.LENS.rays_from_raw(recording.ground_raw)
+    equal = fit_poses(rays, np.ones(rays.shape[:2]), ground.points_m, reference.pose, robust=False)
+    return float(np.abs(equal.centre_m - centre_m).mean())
+
+
+# --- self-calibration ------------------------------------------------------------------------------------------------
+
+
+def wrong_lens() -> Lens:
+    K = scene.LENS.camera_matrix.copy()
+    K[0, 0] *= 1 + 9e-4
+    K[1, 1] *= 1 + 9e-4
+    K[:2, 2] += [2.0, -1.5]
+    return replace(scene.LENS, camera_matrix=K)
+
+
+def test_a_wrong_lens_is_corrected_from_what_stands_still() -> None:
+    solution = solved(scene.recording(3e-4), wrong_lens())
+    found = solution.self_calibration
+    assert found is not None
+    assert found.rms_after_m < 0.5 * found.rms_before_m
+    assert rms_mm(solution.histories["roof"]) < 1.0
+    # Its own uncertainty covers what it misses: the truth lies within three standard deviations.
+    off = [found.correction[2] + 2.0, found.correction[3] - 1.5]
+    assert (np.abs(off) < 3 * found.sigma[2:4]).all()
+
+
+def test_the_rest_after_the_event_calibrates_too() -> None:
+    intervals = {"pre_event": None, "event": (3.0, 6.0), "residual": (6.2, 7.9)}
+    with_rest = solved(scene.recording(0.02), wrong_lens(), intervals_s=intervals)
+    assert corrections(with_rest)["cx"] < -0.3
+    without = solved(scene.recording(0.02), wrong_lens(), intervals_s={"pre_event": None, "residual": None})
+    assert without.self_calibration is not None
+    assert "no interval" in str(without.self_calibration.refused)
+
+
+def test_a_building_that_still_trembles_after_the_event_calibrates_nothing() -> None:
+    intervals = {"pre_event": (0.0, 2.9), "event": (5.5, 7.9), "residual": (3.2, 5.4)}  # in the midst of shaking
+    misled = solved(scene.recording(0.02), intervals_s=intervals)
+    usual = solved(scene.recording(0.02), intervals_s={"pre_event": (0.0, 2.9), "event": (3.0, 7.9)})
+    np.testing.assert_allclose(corrections(misled)["cx"], corrections(usual)["cx"], atol=0.15)
+
+
+def test_ground_that_lags_behind_is_brought_up_to_time() -> None:
+    lag_s, steady = 0.03, scene.recording(0.15)
+    noise = steady.ground_raw - scene.recording().ground_raw
+    late = np.stack([ground_at(frame - lag_s * scene.RATE_HZ) for frame in range(scene.FRAMES)])
+    solution = solved(replace(steady, ground_raw=late + noise))
+    assert corrections(solution)[LAG] == pytest.approx(lag_s, abs=0.006)
+    assert rms_mm(solution.histories["roof"]) < 1.3 * rms_mm(solved(steady).histories["roof"])
+    assert abs(corrections(solved(steady))[LAG]) < 0.006
+
+
+# --- rolling shutter -------------------------------------------------------------------------------------------------
+
+READOUT_S = 0.03
+
+
+def rolled() -> Recording:
+    """What a rolling shutter records: each point at the moment its own row is read."""
+    recording = scene.recording(NOISE_PX)
+    exact = scene.recording()
+    ground, roof = np.empty_like(exact.ground_raw), np.empty_like(exact.targets_raw["roof"])
+    for frame in range(scene.FRAMES):
+        ground[frame] = seen_later(ground_at, row_delay_s(exact.ground_raw[frame], READOUT_S), frame)
+        roof[frame] = seen_later(roof_at, row_delay_s(exact.targets_raw["roof"][frame], READOUT_S), frame)
+    return replace(
+        recording,
+        ground_raw=ground + recording.ground_raw - exact.ground_raw,
+        targets_raw={"roof": roof + recording.targets_raw["roof"] - exact.targets_raw["roof"]},
+    )
+
+
+def test_rows_read_one_after_another_are_brought_to_one_moment() -> None:
+    recording = rolled()
+    known = solved(recording, replace(scene.LENS, readout_s=READOUT_S))
+    best = rms_mm(solved(scene.recording(NOISE_PX)).histories["roof"])
+    assert rms_mm(known.histories["roof"]) < 1.4 * best
+    assert known.readout is not None
+    assert known.readout.source == "lens file"
+
+
+def test_a_rolling_shutter_is_seen_in_the_footage() -> None:
+    found = solved(rolled()).readout
+    assert found is not None
+    assert found.sigma_s is not None
+    assert found.readout_s == pytest.approx(READOUT_S, abs=3 * found.sigma_s)
+    assert "estimated" in found.source
+
+
+def test_a_global_shutter_stays_one_and_says_how_sure_it_is() -> None:
+    found = solved(scene.recording(NOISE_PX)).readout
+    assert found is not None
+    assert found.readout_s == 0.0
+    assert "none longer than" in found.source
+
+
+# --- error bars ------------------------------------------------------------------------------------------------------
+
+
+def test_error_bars_grow_where_the_roof_is_seen_worse() -> None:
+    recording = scene.recording(NOISE_PX)
+    random = np.random.default_rng(7)
+    roof = recording.targets_raw["roof"].copy()
+    shaking = (recording.time_s > 3.0) & (recording.time_s < 6.0)
+    pieces = np.repeat(random.normal(scale=0.3, size=(shaking.sum(), 3, 8, 1, 2)), scene.STATIONS // 8, axis=2)
+    roof[shaking] += pieces
+    history = solved(replace(recording, targets_raw={"roof": roof})).histories["roof"]
+    before = np.median(history.p1_sigma_m[recording.time_s < 2.5])
+    during = np.median(history.p1_sigma_m[(recording.time_s > 3.8) & (recording.time_s < 5.2)])
+    assert during > 2.0 * before
+
+
+def test_a_line_of_which_hardly_anything_is_seen_leaves_its_frame_lost() -> None:
+    recording = scene.recording(NOISE_PX)
+    roof = recording.targets_raw["roof"].copy()
+    roof[50, 2, 3:] = np.nan  # T1 alone says where the roof is along L1 and L2
+    roof[60, 0] = np.nan  # L2 still says what L1 did
+    history = solved(replace(recording, targets_raw={"roof": roof})).histories["roof"]
+    assert history.status[50] == Status.LOST
+    assert np.isnan(history.p1_m[50]).all()
+    assert history.status[60] == Status.WEAK
+    assert np.abs(error_m(history)[60]).max() < 5e-3
