@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 from app import cli
+from core.chunks import Chunk
 from core.lens import read_lens, write_lens
-from core.measure import Chunk, make_measurer, measure_chunk
+from core.measure import make_measurer, measure_chunk
 from core.measurements import MeasurementStore
 from core.project import read_project
 from core.results import Status, read_history_csv
