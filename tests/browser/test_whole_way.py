@@ -164,7 +164,7 @@ def tell_intervals(page: Page, pages: str, decided: Project) -> None:
 
 def sweep_corners(page: Page, pages: str) -> None:
     """Take the knee of the sweep as corner frequency: for the preview, no filter is applied."""
-    expect(page.get_by_text("Take the knee")).to_be_visible()
+    expect(page.get_by_text("Take the knee")).to_be_visible(timeout=60_000)
     page.keyboard.press("k")
     saved(page)
     eventually(lambda: not ask(pages, "results")["stale"], seconds=90)

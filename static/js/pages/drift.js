@@ -266,6 +266,7 @@ function ask() {
   refilter(corner_hz);
   const rest = store.project.intervals_s.pre_event;
   if (rest === null) return showNoInterval();
+  if (sweep === null) kneeWords.textContent = "Looking for the knee…";
   resweep(rest);
   respectrum(rest);
 }
