@@ -19,7 +19,7 @@ from core.coordinates import Bools, Floats, finite_median
 SUSPICIOUS = 3.0
 ITERATIONS = 6
 # Steps for which derivatives are taken anew: the relation is all but straight.
-LINEARISED = 3
+LINEARISED = 2
 # Steps after which the noise of the stationary part is, at least, what then remains of it.
 INFLATING = 2
 

@@ -48,13 +48,13 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
     reference = fit_with_relief(project, lens, relief)
     assert reference.pose is not None
     start = Calibration(lens, reference.pose, heights)
-    readout = _readout(recording, start, reference, relief)
-    recording = at_frame_times(recording, lens, readout.readout_s, ground_speed(recording, lens))
+    speed = ground_speed(recording, lens)
+    readout = _readout(recording, speed, start, reference, relief)
+    recording = at_frame_times(recording, lens, readout.readout_s, speed)
     evidence = Evidence.of(recording, project, start, reference, relief)
     calibration = calibrate(evidence)
     used = evidence.corrected(calibration.correction)
-    behind = used.lag_s * np.nan_to_num(ground_speed(recording, lens))
-    caught_up = replace(recording, ground_raw=recording.ground_raw + behind)
+    caught_up = replace(recording, ground_raw=recording.ground_raw + used.lag_s * np.nan_to_num(speed))
     ground = solve_ground(caught_up, used.lens, used.pose0, reference.origin_m, relief)
     flight, ground = _smoothed(caught_up, ground, used.lens)
     slow_m = calibration_sigma(evidence, calibration)
@@ -94,15 +94,17 @@ def _height_of(target: Target) -> float:
     return target.height_m
 
 
-def _readout(recording: Recording, start: Calibration, reference: ReferenceFit, relief: Relief | None) -> Readout:
+def _readout(
+    recording: Recording, speed: Floats, start: Calibration, reference: ReferenceFit, relief: Relief | None
+) -> Readout:
     """Return the rolling shutter as the lens file says it, or as the ground shows it wherever the view turns."""
     if start.lens.readout_s:
         return Readout(start.lens.readout_s, None, "lens file")
-    some = recording.selected(np.unique(np.linspace(0, len(recording.frame) - 1, READOUT_FRAMES).astype(np.int64)))
+    chosen = np.unique(np.linspace(0, len(recording.frame) - 1, READOUT_FRAMES).astype(np.int64))
+    some = recording.selected(chosen)
     ground = solve_ground(some, start.lens, start.pose0, reference.origin_m, relief)
     poses = ground.known_poses
-    speed = ground_speed(recording, start.lens)[np.isin(recording.frame, some.frame)]
-    shifted = at_frame_times(replace(some, targets_raw={}), start.lens, READOUT_STEP_S, speed)
+    shifted = at_frame_times(replace(some, targets_raw={}), start.lens, READOUT_STEP_S, speed[chosen])
     rays = start.lens.rays_from_raw(shifted.ground_raw)
     moved = fit_poses(rays, poses.weight, ground.points_m, poses, iterations=3, robust=False)
     change = (moved.residual - poses.residual) / READOUT_STEP_S

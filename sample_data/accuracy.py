@@ -7,6 +7,7 @@ kept; it is measured anew each time, because the engine is what is on trial.
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,12 +27,14 @@ from core.results import Status, TargetHistory
 from core.run import FRAMES_FILE, LoadedInputs, load_inputs
 from core.solution import Solution
 from core.solve import filtered, solve
-from sample_data.bound import displacement_bound
+from sample_data.bound import camera_bound, displacement_bound
 from sample_data.catalogue import SCENES, build
 from sample_data.make import make
 from sample_data.tables import README, markdown_table, write_between_markers
 
 CACHE = Path("workspace/accuracy")
+Size = tuple[int, int]
+SIZE = re.compile(r"\d+x\d+")
 TRUTH_FILE = "truth.npz"
 # The paper's corner frequencies, and RMS it reports after filtering.
 PAPER_CORNER_HZ = {"eq5": 0.3, "eq5_slow_drift": 0.3}
@@ -81,6 +84,7 @@ class Score:
         sigma_by_scatter: (2, 2) stated sigma by scatter in the stationary part.
         within_two_sigma: share of values.
         rms_by_bound: RMS by what one frame can tell at best.
+        camera_by_bound: noise of single poses' positions by what one frame can tell at best.
         frame_ms: time for a frame.
     """
 
@@ -92,6 +96,7 @@ class Score:
     sigma_by_scatter: Floats
     within_two_sigma: float
     rms_by_bound: float
+    camera_by_bound: float
     frame_ms: float
     limit: Limit
 
@@ -126,7 +131,7 @@ class PaperScore:
 # --- one clip --------------------------------------------------------------------------------------------------------
 
 
-def rendered(name: str, seed: int, size: tuple[int, int] | None, seconds: float | None, cache: Path) -> Path:
+def rendered(name: str, seed: int, size: Size | None, seconds: float | None, cache: Path) -> Path:
     """Return the folder of a scene, rendered if it is not there yet."""
     label = f"{name}-{seed}"
     label += f"-{size[0]}x{size[1]}" if size else ""
@@ -170,8 +175,8 @@ def true_displacement(truth: Mapping[str, NDArray[np.float64]], name: str, rest_
     return np.asarray(motion[:, None, :2] + turned)
 
 
-def score(name: str, inputs: LoadedInputs, keep: bool) -> list[Score]:
-    """Measure a scene and return the errors of each of its targets."""
+def score(name: str, inputs: LoadedInputs, keep: bool, size: Size | None = None) -> list[Score]:
+    """Measure a scene and return the errors of each of its targets; `size` where it is not the scene's own."""
     truth = dict(np.load(inputs.folder / TRUTH_FILE))
     recording, solution, frame_ms = measured(inputs, keep=keep)
     scores = []
@@ -182,10 +187,14 @@ def score(name: str, inputs: LoadedInputs, keep: bool) -> list[Score]:
         alone = target.relative_to is None
         noise = SCENES[name].noise
         bound_m = displacement_bound(inputs, recording, solution, target, noise) if alone else np.nan
-        label = name if len(inputs.project.targets) == 1 else f"{name}: {target.name}"
-        scores.append(
-            _scored(label, history, true, truth["hidden"], inputs.project.intervals_s, bound_m, frame_ms, name)
-        )
+        camera_by_bound = np.nan
+        if solution.flight is not None:
+            ratios = solution.flight.noise_m / camera_bound(inputs, recording, solution, noise)
+            camera_by_bound = float(ratios[:2].mean())
+        label = name if size is None else f"{name}, {size[0]}×{size[1]}"
+        label += f": {target.name}" if len(inputs.project.targets) > 1 else ""
+        one = _scored(label, history, true, truth["hidden"], inputs.project.intervals_s, bound_m, frame_ms, name)
+        scores.append(replace(one, camera_by_bound=camera_by_bound))
     return scores
 
 
@@ -218,6 +227,7 @@ def _scored(
         sigma_by_scatter=stated / scatter,
         within_two_sigma=float(np.mean(np.abs(error[finite]) <= 2 * sigma[finite])),
         rms_by_bound=float(np.sqrt((rms**2).mean()) / bound_m),
+        camera_by_bound=np.nan,
         frame_ms=frame_ms,
         limit=LIMITS.get(scene, NO_LIMIT),
     )
@@ -279,6 +289,7 @@ HEADER = (
     "σ by scatter",
     "within 2 σ, %",
     "by bound",
+    "camera by bound",
     "limit, mm",
     "",
 )
@@ -309,18 +320,21 @@ def _row(name: str, group: Sequence[Score]) -> list[str]:
         f"{100 * max(one.lost_share for one in group):.1f} / {100 * max(one.weak_share for one in group):.1f}",
         f"{np.nanmin(ratios):.2f}–{np.nanmax(ratios):.2f}",
         f"{min(shares):.0f}" if len(group) == 1 else f"{min(shares):.0f}–{max(shares):.0f}",
-        _middle([one.rms_by_bound for one in group]),
+        *(
+            _middle(values, digits=0)
+            for values in ([one.rms_by_bound for one in group], [one.camera_by_bound for one in group])
+        ),
         " / ".join(asked) or "–",
         ("ok" if all(one.keeps for one in group) else "missed") if limit != NO_LIMIT else "",
     ]
 
 
-def _middle(values: Sequence[float]) -> str:
+def _middle(values: Sequence[float], digits: int = 2) -> str:
     """Return a value, or of several the median and the worst."""
     if np.isnan(values).all():
         return "–"
     median, worst = np.nanmedian(values), np.nanmax(values)
-    return f"{median:.2f}" if len(values) == 1 else f"{median:.2f} ({worst:.2f})"
+    return f"{median:.{digits}f}" if len(values) == 1 else f"{median:.{digits}f} ({worst:.{digits}f})"
 
 
 def paper_table(scores: Sequence[PaperScore]) -> str:
@@ -345,19 +359,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = _parser().parse_args(arguments)
     cv2.setNumThreads(2)
     chosen.cache.mkdir(parents=True, exist_ok=True)
-    size = tuple(int(part) for part in chosen.size.split("x")) if chosen.size else None
-    assert size is None or len(size) == 2
     scores: list[Score] = []
     papers: list[PaperScore] = []
     wanted = [name for name in chosen.scenes.split(",") if name]
     for name, is_paper in _rounds(wanted, chosen.paper):
-        for seed in [int(part) for part in chosen.seeds.split(",")]:
+        for seed, size in _clips(name, chosen):
             inputs = load_inputs(rendered(name, seed, size, chosen.seconds, chosen.cache))
             if is_paper:
                 papers.append(score_paper(name, inputs, chosen.keep))
                 _say(f"{name}-{seed}: the published way\n{paper_table(papers[-1:])}\n")
             else:
-                scores += (new := score(name, inputs, chosen.keep))
+                scores += (new := score(name, inputs, chosen.keep, size))
                 _say(f"{name}-{seed}: {new[0].frame_ms:.0f} ms a frame\n{table(new)}\n")
     text = "\n\n".join(
         part for part in (table(scores) if scores else "", paper_table(papers) if papers else "") if part
@@ -371,6 +383,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if missed else 0
 
 
+def _clips(name: str, chosen: argparse.Namespace) -> list[tuple[int, Size | None]]:
+    """Return seeds and sizes of a scene's clips: those asked for, or those that lie in the cache."""
+    if not chosen.rendered:
+        size = _size(chosen.size) if chosen.size else None
+        return [(int(part), size) for part in chosen.seeds.split(",")]
+    found = []
+    for video in sorted(chosen.cache.glob(f"{name}-*/video.mp4")):
+        seed, _, size = video.parent.name.removeprefix(f"{name}-").partition("-")
+        if seed.isdigit() and (not size or SIZE.fullmatch(size)):
+            found.append((int(seed), _size(size) if size else None))
+    return found
+
+
+def _size(text: str) -> Size:
+    width, _, height = text.partition("x")
+    return int(width), int(height)
+
+
 def _rounds(scenes: Iterable[str], paper: str) -> list[tuple[str, bool]]:
     return [*((name, False) for name in scenes), *((name, True) for name in paper.split(",") if name)]
 
@@ -380,6 +410,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--scenes", default=",".join(USUAL_SCENES), help=f"of {', '.join(sorted(SCENES))}")
     parser.add_argument("--paper", default=",".join(PAPER_SCENES), help="scenes measured the published way too")
     parser.add_argument("--seeds", default="1")
+    parser.add_argument(
+        "--rendered", action="store_true", help="take the clips of whatever seeds that lie in the cache"
+    )
     parser.add_argument("--size", help="WIDTHxHEIGHT of the videos; the field of view stays")
     parser.add_argument("--seconds", type=float, help="length of the clips")
     parser.add_argument("--cache", type=Path, default=CACHE, help="where rendered scenes are kept")

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from core.bodies import rest_body
-from core.camera import exponential, intersect_height, project
+from core.camera import exponential, intersect_height, jacobians, project
 from core.coordinates import Floats, rotation_2d
 from core.measurements import Recording
 from core.patches import HALF_PX
@@ -83,6 +83,21 @@ def displacement_bound(
         lever = np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]]])
         variances.append(np.diag(lever @ covariance @ lever.T))
     return float(np.sqrt(np.mean(variances)))
+
+
+def camera_bound(inputs: LoadedInputs, recording: Recording, solution: Solution, noise: tuple[float, float]) -> Floats:
+    """Return the least standard deviation (3,) of the camera's position from one frame's ground, metres.
+
+    Rotation and position are both unknown here, as they are for a single pose: what a smooth flight starts from.
+    """
+    luma = read_frame(inputs.video, inputs.project.reference_frame).luma
+    pose, lens = solution.reference.pose, solution.lens
+    assert pose is not None
+    at = patches(luma, recording.reference.ground_raw, noise)
+    rays, J = jacobians(pose.R[None], pose.centre_m[None], solution.ground.points_m)
+    slopes = lens.jacobian_raw_rays(rays[0]) @ J[0]
+    fisher = np.einsum("niu,nij,njv->uv", slopes, at.information, slopes)
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(fisher))[3:]))
 
 
 def _fisher(raw_of: Callable[[Floats], Floats], at: Sightings) -> Floats:
