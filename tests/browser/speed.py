@@ -117,8 +117,10 @@ NUDGED = """([key, selector]) => new Promise((resolve) => {
 
 def stepping(browser: Browser, pages: str) -> None:
     with watched(browser, pages, viewport=WINDOW) as page:
-        page.goto(f"{pages}/review?frame=200")
-        page.wait_for_selector(".review-frame[data-frame='200']")
+        last = ask(pages, "results/roof")["frame"][-1]
+        first = last // 3
+        page.goto(f"{pages}/review?frame={first}")
+        page.wait_for_selector(f".review-frame[data-frame='{first}']")
         page.wait_for_timeout(3000)
 
         def steps(key: str, frames: Sequence[int], pause_ms: int) -> list[float]:
@@ -129,14 +131,14 @@ def stepping(browser: Browser, pages: str) -> None:
                 page.wait_for_timeout(pause_ms)
             return found
 
-        tell("review, next frame", steps(".", range(201, 216), 250))
-        tell("review, first step back", steps(",", [214], 250))
-        tell("review, further steps back", steps(",", range(213, 190, -1), 250))
+        tell("review, next frame", steps(".", range(first + 1, first + 16), 250))
+        tell("review, first step back", steps(",", [first + 14], 250))
+        tell("review, further steps back", steps(",", range(first + 13, first - 10, -1), 250))
         times = []
-        for frame in (400, 95, 333, 27, 500):
-            times.append(page.evaluate(JUMP, frame))
+        for share in (0.8, 0.2, 0.67, 0.05, 0.95):
+            times.append(page.evaluate(JUMP, round(share * last)))
             page.wait_for_timeout(2500)
-        tell("review, far jump, first picture", [first for first, _ in times])
+        tell("review, far jump, first picture", [early for early, _ in times])
         tell("review, far jump, every pixel", [whole for _, whole in times])
 
 
