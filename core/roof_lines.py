@@ -202,18 +202,16 @@ class LineTracker:
 
     def _edges(self, section: _Section, offset: float) -> Floats:
         """Return both edges (STATIONS, 2, 2) where the response to a derivative of a Gaussian is extreme."""
-        station = np.minimum((section.place * STATIONS).astype(np.int64), STATIONS - 1)
-        members = (station == np.arange(STATIONS)[:, None]).astype(np.float32)
+        members = _membership(section.place)
         line = section.across + self.profile.offset_px + self.profile.tilt_px * section.x + offset
-        count = np.bincount(station, minlength=STATIONS).astype(np.float64)
-        filled = np.maximum(count, 1.0)
-        along = np.bincount(station, section.along, STATIONS) / filled
-        middle = np.bincount(station, line, STATIONS) / filled
+        count = members.sum(axis=1)
+        filled = np.maximum(count, 1e-9)
+        along, middle = members @ section.along / filled, members @ line / filled
         wanted = 0.5 * np.median(count[count > 0])
         side = np.array([[-1.0], [1.0]])
         edge = line + side * self.profile.width_px / 2
         slope_sign = -side * self.profile.polarity
-        shift, strength = _extremes(section, edge, station, members, slope_sign, self._scale_px())
+        shift, strength = _extremes(section, edge, members, slope_sign, self._scale_px())
         good = (count >= wanted) & (np.abs(shift) < self._capture_px()) & (strength > 0.25 * self.profile.edge)
         found = np.full((STATIONS, 2, 2), np.nan)
         found[..., section.axis] = np.where(good, along, np.nan).T
@@ -249,11 +247,23 @@ def _correlations(windows: Floats, signature: Singles) -> Floats:
     return np.asarray((pieces @ signature) / np.maximum(norm, 1e-6 + 0.5 * np.sqrt(len(signature))))
 
 
+def _membership(place: Floats) -> Floats:
+    """Return the share (STATIONS, n) of each column that belongs to each station.
+
+    A column on the border between two stations belongs to both: where it lies is predicted, and what is measured must
+    not jump with the last digit of a prediction.
+    """
+    half = 0.5 * abs(place[-1] - place[0]) / max(len(place) - 1, 1)
+    borders = np.arange(STATIONS + 1)[:, None] / STATIONS
+    borders[0], borders[-1] = -np.inf, np.inf
+    covered = np.clip(borders, place - half, place + half)
+    return np.diff(covered, axis=0) / (2.0 * half)
+
+
 def _extremes(
     section: _Section,
     edge: Floats,
-    station: NDArray[np.int64],
-    members: Singles,
+    members: Floats,
     slope_sign: Floats,
     scale_px: float,
 ) -> tuple[Floats, Floats]:
@@ -264,8 +274,7 @@ def _extremes(
 
     Args:
         edge: (2, n) expected place of both edges in each column.
-        station: (n,) of each column.
-        members: (STATIONS, n) one where a column belongs to a station.
+        members: (STATIONS, n) share of each column that belongs to a station.
         slope_sign: (2, 1) of each edge's slope.
     """
     half = int(np.ceil(3.0 * scale_px)) + 1
@@ -273,9 +282,9 @@ def _extremes(
     rows = np.arange(len(section.across))[:, None]
     last = section.values.shape[1] - 1
     expected = edge - (np.rint(section.across) - section.half)
-    shift = np.zeros((2, STATIONS))
+    shift, pooling = np.zeros((2, STATIONS)), members.astype(np.float32)
     for _ in range(HALLEY_STEPS):
-        position = expected + shift[:, station]
+        position = expected + shift @ members
         nearest = np.rint(position)
         index = np.clip(nearest[..., None].astype(np.int64) + taps, 0, last)
         sample = section.values[rows, index]
@@ -294,7 +303,7 @@ def _extremes(
             ],
             axis=-1,
         ).astype(np.float32)
-        response, first, second, third, power = np.moveaxis((members @ by_column).astype(np.float64), -1, 0)
+        response, first, second, third, power = np.moveaxis((pooling @ by_column).astype(np.float64), -1, 0)
         strength = slope_sign * response / np.maximum(power, 1e-9)
         curved = second * slope_sign < 0
         denominator = 2.0 * second**2 - first * third

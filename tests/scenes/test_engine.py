@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 from app import cli
+from core import measure as measuring
 from core.chunks import Chunk
 from core.lens import read_lens, write_lens
 from core.measure import make_measurer, measure_chunk
@@ -261,6 +263,16 @@ def test_ctrl_c_keeps_what_was_measured(clip, history, tmp_path):
 
 def test_two_workers_measure_the_same(clip, history, tmp_path):
     folder = project_copy(clip, tmp_path / "workers")
+    assert largest_difference_m(measured_history(folder, workers=2), history) < SAME_M
+
+
+def test_a_chunk_may_begin_anywhere(clip, history, tmp_path, monkeypatch):
+    black = np.flatnonzero((history.time_s >= BLACK_S[0]) & (history.time_s <= BLACK_S[1]))
+    # In the black, right behind it, in the strongest shaking, and where no key frame is near.
+    edges = [0, 41, int(black[1]), int(black[-1]) + 2, int(black[-1]) + 12, 133, ALL_FRAMES]
+    chunks = [Chunk(start, stop) for start, stop in itertools.pairwise(edges)]
+    monkeypatch.setattr(measuring, "missing_chunks", lambda done, index, parts: chunks)
+    folder = project_copy(clip, tmp_path / "pieces")
     assert largest_difference_m(measured_history(folder, workers=2), history) < SAME_M
 
 
