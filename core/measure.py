@@ -91,7 +91,7 @@ def measure_chunk(
 
     Args:
         before: the last two frames before the chunk, where known; otherwise the chunk finds its own way in.
-        threads: decoder threads, 0 for one per core.
+        threads: decoder threads, as `read_frames`.
         index: of the video, where it is known already.
     """
     history = list(before)[-2:]

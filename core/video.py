@@ -29,6 +29,8 @@ from core.storage import File, FileState, opened, state_of
 Luma = NDArray[np.uint8]
 # Frames decoded ahead of the one being measured: enough to keep the decoder busy, 12 MB each at 4K.
 READ_AHEAD = 6
+# A decoder's threads wait for each other and for whoever takes the frames: several for each core keep it busy.
+THREADS_PER_CORE = 3
 MOST_THREADS = 16
 EIGHT_BIT_LUMA = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 
@@ -177,12 +179,13 @@ def read_frames(
     """Yield frames `start` to `stop` (exclusive; None for all), decoding ahead in a thread of its own.
 
     Args:
-        threads: decoder threads, 0 for one per core.
+        threads: decoder threads, 0 for as many as keep all cores busy while somebody works on the frames.
         index: of the file, where it is known already; read where it is needed and None.
 
     Raises:
         InputError: the file cannot be read, or `start` lies beyond its end.
     """
+    threads = threads or min(MOST_THREADS, THREADS_PER_CORE * available_cores())
     ahead: queue.Queue[Frame | Exception | None] = queue.Queue(maxsize=READ_AHEAD)
     stopped = threading.Event()
 
@@ -225,7 +228,7 @@ def read_frame(path: File, number: int, *, index: FrameIndex | None = None) -> F
     Raises:
         InputError: as `read_frames`, or there is no such frame.
     """
-    for frame in _decoded(path, number, number + 1, 0, index):
+    for frame in _decoded(path, number, number + 1, available_cores(), index):
         return frame
     raise InputError(f"{path}: has no frame {number}; choose a smaller frame number.")
 
@@ -247,7 +250,7 @@ def read_frames_rgb(path: File, start: int = 0, stop: int | None = None) -> Iter
     Raises:
         InputError: as `read_frames`.
     """
-    for picture, index in _pictures(path, start, stop, 0, None):
+    for picture, index in _pictures(path, start, stop, available_cores(), None):
         yield index, np.ascontiguousarray(np.rot90(picture.to_ndarray(format="rgb24"), picture.rotation // 90))
 
 
@@ -266,8 +269,7 @@ def _pictures(
     """Yield decoded pictures with their frame numbers; numbers after a seek come from the timestamps alone."""
     with _opened(path) as (container, stream):
         stream.codec_context.thread_type = "AUTO"
-        # Left to itself, FFmpeg takes one thread more than there are cores, which then get in each other's way.
-        stream.codec_context.thread_count = threads or min(MOST_THREADS, available_cores())
+        stream.codec_context.thread_count = threads
         position = _seek(container, stream, path, start, index) if start > 0 else None
         number = 0
         for picture in _until_damaged(container, stream):
