@@ -164,12 +164,11 @@ def calibrate(evidence: Evidence) -> SelfCalibration:
     groups, part = _stationary_groups(parts, evidence.ground.usable)
     motion = target_motion(evidence, groups)
     at_start = motion(np.zeros(len(parameters)))
-    sigma = np.full(at_start.shape, np.nan)
-    for number in np.unique(part):
-        sigma[part == number] = _noise(at_start[part == number])
-    sigma = np.where(np.isfinite(at_start), sigma, np.nan)
-    trembling = [number for number in np.unique(part)[1:] if _trembles(sigma[part == number], sigma[part == 0])]
-    sigma[np.isin(part, trembling)] = np.nan
+    noise = {int(number): _noise(at_start[part == number]) for number in np.unique(part)}
+    usual = noise[int(part[0])]
+    calm = [number for number, own in noise.items() if (own <= TREMBLING * usual + LEAST_NOISE_M).all()]
+    sigma = np.stack([noise[int(number)] for number in part])
+    sigma[~(np.isfinite(at_start) & np.isin(part, calm)[:, None])] = np.nan
     return self_calibrate(parameters, motion, sigma, ground_misfit(evidence), part=part)
 
 
@@ -187,15 +186,10 @@ def _stationary_groups(parts: Sequence[Bools], usable: Bools) -> tuple[list[NDAr
 
 
 def _noise(motion: Floats) -> Floats:
-    """Return the noise (K,) of moments (B, K), from how unevenly they follow each other."""
+    """Return the noise (K,) of moments (B, K), from how unevenly they follow each other; boundless if they are few."""
     if len(motion) < 3:
-        return np.full(motion.shape[1], np.nan)
+        return np.full(motion.shape[1], np.inf)
     return np.maximum(1.4826 * finite_median(np.abs(np.diff(motion, n=2, axis=0)).T) / np.sqrt(6.0), LEAST_NOISE_M)
-
-
-def _trembles(sigma: Floats, usual: Floats) -> bool:
-    here, before = np.nanmedian(sigma, axis=0), np.nanmedian(usual, axis=0)
-    return not bool((here < TREMBLING * before + LEAST_NOISE_M).all())
 
 
 @dataclass(frozen=True)
