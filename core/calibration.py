@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from core.measurements import Recording
 from core.motion import is_determined
 from core.project import Project, Target
 from core.relief import Relief
-from core.row_times import ALIKE, ground_speed
+from core.row_times import ALIKE
 from core.self_calibration import Parameter, SelfCalibration, refused, self_calibrate
 from core.solution import Ground
 
@@ -80,14 +81,23 @@ class Evidence:
 
     @classmethod
     def of(
-        cls, recording: Recording, project: Project, start: Calibration, reference: ReferenceFit, relief: Relief | None
+        cls,
+        recording: Recording,
+        speed: Floats,
+        project: Project,
+        start: Calibration,
+        reference: ReferenceFit,
+        relief: Relief | None,
     ) -> Evidence:
-        """Return the evidence a recording holds."""
-        some = _thinned(recording)
+        """Return the evidence a recording holds; `speed` as `core.row_times.ground_speed`."""
+        # Calibration shows in slow motion, which needs no more features.
+        kept = slice(None, None, max(1, recording.ground_raw.shape[1] // FEATURES))
+        thinned = replace(recording.reference, ground_raw=recording.reference.ground_raw[kept])
+        some = replace(recording, reference=thinned, ground_raw=recording.ground_raw[:, kept])
         ground = solve_ground(some, start.lens, start.pose0, reference.origin_m, relief)
-        return cls(some, ground_speed(some, start.lens), project, start, reference, relief, ground)
+        return cls(some, speed[:, kept], project, start, reference, relief, ground)
 
-    @property
+    @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         """What may be corrected; in the order of all corrections (P,)."""
         lens = self.start.lens
@@ -110,7 +120,7 @@ class Evidence:
             Parameter(LAG, "s", self._lag_sigma_s),
         )
 
-    @property
+    @cached_property
     def _elevation(self) -> Floats | None:
         return click_elevation(self.project, self.relief)
 
@@ -321,13 +331,6 @@ def stationary(time_s: Floats, project: Project) -> Bools:
     """Return which frames the project says the building stood still in before the event."""
     interval = project.intervals_s.pre_event
     return within(time_s, interval) if interval is not None else np.zeros(len(time_s), dtype=bool)
-
-
-def _thinned(recording: Recording) -> Recording:
-    """Return a recording with fewer ground features: calibration shows in slow motion, which needs no more."""
-    kept = slice(None, None, max(1, recording.ground_raw.shape[1] // FEATURES))
-    reference = replace(recording.reference, ground_raw=recording.reference.ground_raw[kept])
-    return replace(recording, reference=reference, ground_raw=recording.ground_raw[:, kept])
 
 
 def _mean_seen(values: Floats) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from core.camera import Pose, PoseFit, fit_poses, intersect_height, plan_homographies
-from core.coordinates import Floats, finite_median, finite_rows
+from core.coordinates import Floats, finite_median
 from core.georeference import ReferenceFit, fit_reference
 from core.lens import Lens
 from core.measurements import Recording
@@ -70,9 +70,8 @@ def _trust(poses: PoseFit) -> Floats:
 
     One corner keeps its place to a thirtieth of a pixel in all frames, another, on grass, to half a pixel.
     """
-    residual = np.where(finite_rows(poses.residual)[..., None], poses.residual, np.nan)
-    own = residual - finite_median(np.moveaxis(residual, 0, -1))
-    sigma = 1.4826 * finite_median(np.moveaxis(np.abs(own), 1, 0).reshape(residual.shape[1], -1))
+    own = poses.residual - finite_median(np.moveaxis(poses.residual, 0, -1))
+    sigma = 1.4826 * finite_median(np.moveaxis(np.abs(own), 1, 0).reshape(own.shape[1], -1))
     known = sigma > 0
     usual = float(np.median(sigma[known])) if known.any() else 1.0
     return np.where(known, (usual / np.maximum(sigma, LEAST_SCATTER * usual)) ** 2, 0.0)

@@ -56,8 +56,8 @@ def differentiated(track: Floats, time_s: Floats) -> Floats:
         return rate
     span = np.diff(time_s).reshape(-1, *[1] * (track.ndim - 1))
     forward = np.diff(track, axis=0) / span
-    rate[:-1], before = forward, forward
-    rate[1:] = np.where(np.isfinite(rate[1:]), rate[1:], before)
+    rate[:-1] = forward
+    rate[1:] = np.where(np.isfinite(rate[1:]), rate[1:], forward)
     both = np.isfinite(forward[1:]) & np.isfinite(forward[:-1])
     weight = span[:-1] / (span[1:] + span[:-1])  # exact for a parabola, however the frames are spaced
     rate[1:-1] = np.where(both, weight * forward[1:] + (1.0 - weight) * forward[:-1], rate[1:-1])

@@ -51,7 +51,7 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
     speed = ground_speed(recording, lens)
     readout = _readout(recording, speed, start, reference, relief)
     recording = at_frame_times(recording, lens, readout.readout_s, speed)
-    evidence = Evidence.of(recording, project, start, reference, relief)
+    evidence = Evidence.of(recording, speed, project, start, reference, relief)
     calibration = calibrate(evidence)
     used = evidence.corrected(calibration.correction)
     caught_up = replace(recording, ground_raw=recording.ground_raw + used.lag_s * np.nan_to_num(speed))

@@ -179,18 +179,17 @@ def score(name: str, inputs: LoadedInputs, keep: bool, size: Size | None = None)
     """Measure a scene and return the errors of each of its targets; `size` where it is not the scene's own."""
     truth = dict(np.load(inputs.folder / TRUTH_FILE))
     recording, solution, frame_ms = measured(inputs, keep=keep)
+    noise, camera_by_bound = SCENES[name].noise, np.nan
+    if solution.flight is not None:
+        ratios = solution.flight.noise_m / camera_bound(inputs, recording, solution, noise)
+        camera_by_bound = float(ratios[:2].mean())
     scores = []
     for target in inputs.project.targets:
         history = solution.histories[target.name]
         rest = solution.targets[target.name].rest_m
         true = true_displacement(truth, target.name, rest, target.kind)
         alone = target.relative_to is None
-        noise = SCENES[name].noise
         bound_m = displacement_bound(inputs, recording, solution, target, noise) if alone else np.nan
-        camera_by_bound = np.nan
-        if solution.flight is not None:
-            ratios = solution.flight.noise_m / camera_bound(inputs, recording, solution, noise)
-            camera_by_bound = float(ratios[:2].mean())
         label = name if size is None else f"{name}, {size[0]}×{size[1]}"
         label += f": {target.name}" if len(inputs.project.targets) > 1 else ""
         one = _scored(label, history, true, truth["hidden"], inputs.project.intervals_s, bound_m, frame_ms, name)
