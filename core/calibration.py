@@ -94,7 +94,8 @@ class Evidence:
         kept = slice(None, None, max(1, recording.ground_raw.shape[1] // FEATURES))
         thinned = replace(recording.reference, ground_raw=recording.reference.ground_raw[kept])
         some = replace(recording, reference=thinned, ground_raw=recording.ground_raw[:, kept])
-        ground = solve_ground(some, start.lens, start.pose0, reference.origin_m, relief)
+        frame0 = project.reference_frame
+        ground = solve_ground(some, start.lens, start.pose0, reference.origin_m, relief, reference_frame=frame0)
         return cls(some, speed[:, kept], project, start, reference, relief, ground)
 
     @cached_property

@@ -7,9 +7,9 @@ only has to be good to a few pixels, and the measurement then finds its own plac
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -259,18 +259,18 @@ class TargetFinder:
         knots = [np.linspace(0.0, float(n - 1), 17) for n in size]
         u, v = np.meshgrid(*knots)
         rays0 = low + np.stack([u, v], axis=-1) * self._step
-        raw = self._lens.raw_from_rays(apply_homography(H_ray_ray0, rays0)).astype(np.float32)
-        grid = np.stack(np.meshgrid(*[np.arange(n, dtype=np.float32) * np.float32(16 / (n - 1)) for n in size]), -1)
-        full = cv2.remap(np.nan_to_num(raw, nan=-1e4), grid[..., 0], grid[..., 1], cv2.INTER_LINEAR)
-        return _reduced(luma, np.asarray(full, dtype=np.float32), self._factor)
+        raw = self._lens.raw_from_rays(apply_homography(H_ray_ray0, rays0))
+        raw = np.nan_to_num(raw, nan=-1e4).astype(np.float32)
+        columns, rows = np.meshgrid(*[np.arange(n, dtype=np.float32) * np.float32(16 / (n - 1)) for n in size])
+        return _reduced(luma, cv2.split(cv2.remap(raw, columns, rows, cv2.INTER_LINEAR)), self._factor)
 
 
-def _reduced(luma: Luma, raw: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
-    """Sample a frame at raw pixels (h, w, 2), averaged over squares of `factor` pixels; grey beyond the frame."""
-    height, width = luma.shape
-    low = np.clip(np.floor(raw.min(axis=(0, 1))) - factor, 0, [width - 1, height - 1]).astype(int)
-    high = np.clip(np.ceil(raw.max(axis=(0, 1))) + factor + 1, low + 1, [width, height]).astype(int)
+def _reduced(luma: Luma, raw: Sequence[NDArray[Any]], factor: int) -> NDArray[np.uint8]:
+    """Sample a frame at raw pixels u and v, (h, w) each, as means of squares of `factor` pixels; grey beyond it."""
+    size = np.array(luma.shape[::-1])
+    low = np.clip([int(np.floor(each.min())) - factor for each in raw], 0, size - 1)
+    high = np.clip([int(np.ceil(each.max())) + factor + 1 for each in raw], low + 1, size)
     block = cv2.blur(np.ascontiguousarray(luma[low[1] : high[1], low[0] : high[0]]), (factor, factor))
-    u, v = raw[..., 0] - np.float32(low[0]), raw[..., 1] - np.float32(low[1])
+    u, v = (each - np.float32(first) for each, first in zip(raw, low, strict=True))
     sampled = cv2.remap(block, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=128)
     return np.asarray(sampled, dtype=np.uint8)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -19,12 +20,14 @@ from core.lens import Lens
 from core.patches import HALF_PX, MARGIN_PX, Matches, PatchTracker
 from core.video import Luma
 
-FEATURES = 300
+# More give no better pose: what compression gets wrong, it gets wrong for all of them alike.
+FEATURES = 220
 # Correlation below which a patch shows something else than in the reference frame.
 LEAST_SCORE = 0.6
 # Ground points needed before a frame's homography is believed.
 LEAST_POINTS = 12
-# Width of the reduced picture in which a lost camera is found again, pixels.
+# Widths of the reduced pictures in which features are chosen and a lost camera is found again, pixels.
+CHOOSING_WIDTH = 1920
 SEARCH_WIDTH = 960
 
 
@@ -79,10 +82,15 @@ def _spread_corners(luma: Luma, allowed: NDArray[np.bool_], count: int) -> Float
     Source: Shi & Tomasi (1994) for the measure of strength.
     """
     height, width = luma.shape
-    smooth = cv2.GaussianBlur(luma, (0, 0), 1.0)
-    quality = np.where(allowed, cv2.cornerMinEigenVal(smooth, blockSize=2 * HALF_PX + 1, ksize=3), 0.0)
-    cell = max(HALF_PX, int(np.sqrt(max(int(np.count_nonzero(allowed)), 1) / count)))
+    factor = max(1, round(width / CHOOSING_WIDTH))
+    small = cv2.resize(luma, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(small, (0, 0), 1.0) if factor == 1 else small
+    strength = cv2.cornerMinEigenVal(smooth, blockSize=2 * (HALF_PX // factor) + 1, ksize=3)
+    allowed_small = allowed[factor // 2 :: factor, factor // 2 :: factor][: small.shape[0], : small.shape[1]]
+    quality = np.where(allowed_small, strength, 0.0)
+    cell = max(HALF_PX, int(np.sqrt(max(int(np.count_nonzero(allowed)), 1) / count))) // factor
     points, strengths = _best_of_cells(quality, cell)
+    points = points * factor + factor // 2
     # What is weaker than a hundredth of the median is plain surface; its position would be noise.
     floor = 0.01 * float(np.median(strengths)) if len(strengths) else 0.0
     points = points[strengths > max(floor, 1e-7)]
@@ -146,10 +154,11 @@ class GroundTracker:
             luma: the frame.
             predicted_H_ray_ray0: from the frames before; None to search without a prediction.
         """
-        if predicted_H_ray_ray0 is not None:
-            found = self._refine(luma, predicted_H_ray_ray0)
-            if found is not None and found.inliers >= max(LEAST_POINTS, len(self.patches) // 4):
-                return found
+        # A hovering camera may well see what it saw in the reference frame.
+        expected = np.eye(3) if predicted_H_ray_ray0 is None else predicted_H_ray_ray0
+        found = self._refine(luma, expected)
+        if found is not None and found.inliers >= max(LEAST_POINTS, len(self.patches) // 4):
+            return found
         searched = self._finder.search(luma)
         if searched is None:
             return None
@@ -212,36 +221,46 @@ class CameraFinder:
 
     def __init__(self, luma: Luma, lens: Lens, allowed: NDArray[np.bool_]) -> None:
         self._lens = lens
-        self._factor = max(1, round(luma.shape[1] / SEARCH_WIDTH))
+        self._size = luma.shape[::-1]
+        factor = max(1, round(luma.shape[1] / SEARCH_WIDTH))
+        self._small_size = (luma.shape[1] // factor, luma.shape[0] // factor)
+        self._tolerance = factor / float(lens.focal_px.mean())
+        # A roof full of features would win the vote for the homography and move the ground instead.
+        kept = cv2.resize(allowed.astype(np.uint8), self._small_size, interpolation=cv2.INTER_NEAREST)
+        self._allowed0: Luma = np.asarray(kept, dtype=np.uint8)
+        self._small0 = self._reduced(luma)
         # OpenCV's detectors differ in their defaults from build to build, so they are written out.
         self._detector = cv2.SIFT.create(nfeatures=1500, contrastThreshold=0.02)
-        # A roof full of features would win the vote for the homography and move the ground instead.
-        self._points0, self._descriptors0 = self._detect(luma, allowed)
         self._matcher = cv2.BFMatcher(cv2.NORM_L2)
+
+    @cached_property
+    def _features0(self) -> tuple[Floats, NDArray[np.float32]]:
+        """Features of the reference frame; most clips are followed from end to end without them."""
+        return self._detect(self._small0, self._allowed0)
 
     def search(self, luma: Luma) -> Floats | None:
         """Return H_ray_ray0 (3, 3), good to a few pixels, or None."""
-        points, descriptors = self._detect(luma, None)
-        if len(points) < LEAST_POINTS or len(self._points0) < LEAST_POINTS:
+        points0, descriptors0 = self._features0
+        points, descriptors = self._detect(self._reduced(luma), None)
+        if len(points) < LEAST_POINTS or len(points0) < LEAST_POINTS:
             return None
-        pairs = [m for m in self._matcher.knnMatch(descriptors, self._descriptors0, k=2) if len(m) == 2]
+        pairs = [m for m in self._matcher.knnMatch(descriptors, descriptors0, k=2) if len(m) == 2]
         kept = [(m.queryIdx, m.trainIdx) for m, second in pairs if m.distance < 0.8 * second.distance]
         if len(kept) < LEAST_POINTS:
             return None
         index = np.array(kept)
-        tolerance = self._factor / float(self._lens.focal_px.mean())
-        source, target = self._points0[index[:, 1]], points[index[:, 0]]
+        source, target = points0[index[:, 1]], points[index[:, 0]]
         usable = finite_rows(source) & finite_rows(target)
-        H, inlier = fit_homography(source[usable], target[usable], tolerance=tolerance)
+        H, inlier = fit_homography(source[usable], target[usable], tolerance=self._tolerance)
         return H if inlier.sum() >= LEAST_POINTS else None
 
-    def _detect(self, luma: Luma, allowed: NDArray[np.bool_] | None) -> tuple[Floats, NDArray[np.float32]]:
-        size = (luma.shape[1] // self._factor, luma.shape[0] // self._factor)
-        small = cv2.resize(luma, size, interpolation=cv2.INTER_AREA)
-        mask = None if allowed is None else cv2.resize(allowed.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    def _reduced(self, luma: Luma) -> Luma:
+        return np.asarray(cv2.resize(luma, self._small_size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+    def _detect(self, small: Luma, mask: Luma | None) -> tuple[Floats, NDArray[np.float32]]:
         keypoints, descriptors = self._detector.detectAndCompute(small, mask)
         if not keypoints:
             return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
-        scale = np.array(luma.shape[::-1]) / np.array(small.shape[::-1])
+        scale = np.array(self._size) / np.array(self._small_size)
         raw = (np.array([k.pt for k in keypoints], dtype=np.float64) + 0.5) * scale - 0.5
         return self._lens.rays_from_raw(raw), np.asarray(descriptors, dtype=np.float32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from core.camera import Pose, PoseFit, fit_poses, intersect_height, plan_homographies
-from core.coordinates import Floats, finite_median
+from core.coordinates import Bools, Floats, finite_median
 from core.georeference import ReferenceFit, fit_reference
 from core.lens import Lens
 from core.measurements import Recording
@@ -19,6 +19,10 @@ LEAST_GROUND = 20
 LEAST_SCATTER = 0.3
 # Least scatter of ground points at which outliers are told, pixels.
 LEAST_SIGMA_PX = 0.01
+# A starved encoder repeats the ground of a key frame in the frames that follow, while strips go on moving. Where features
+# usually scatter by more than the first, pixels, a scatter below this part of it is no view of its own.
+COARSE_PX = 0.15
+REPEATED = 0.45
 
 
 def click_elevation(project: Project, relief: Relief | None) -> Floats | None:
@@ -46,8 +50,20 @@ def ground_points(raw: Floats, lens: Lens, pose0: Pose, origin_m: Floats, relief
     return np.column_stack([xy, z])
 
 
-def solve_ground(recording: Recording, lens: Lens, pose0: Pose, origin_m: Floats, relief: Relief | None) -> Ground:
-    """Return the pose of every frame from the ground features."""
+def solve_ground(
+    recording: Recording,
+    lens: Lens,
+    pose0: Pose,
+    origin_m: Floats,
+    relief: Relief | None,
+    *,
+    reference_frame: int | None = None,
+) -> Ground:
+    """Return the pose of every frame from the ground features.
+
+    Args:
+        reference_frame: the only one in which the features may all lie where the reference frame shows them.
+    """
     points = ground_points(recording.reference.ground_raw, lens, pose0, origin_m, relief)
     rays = lens.rays_from_raw(recording.ground_raw)
     weight = np.isfinite(points).all(axis=1) * np.ones(len(rays))[:, None]
@@ -62,7 +78,14 @@ def solve_ground(recording: Recording, lens: Lens, pose0: Pose, origin_m: Floats
     count = inlier.sum(axis=1)
     rms = np.sqrt(squared.sum(axis=1) / np.maximum(2 * count, 1)) * focal
     usable = (count >= LEAST_GROUND) & np.isfinite(poses.centre_m).all(axis=1) & (poses.centre_m[:, 2] > 0)
+    usable &= ~_repeated(rms, usable) | (recording.frame == reference_frame)
     return Ground(points, agreeing, plan_homographies(poses.R, poses.centre_m), poses, rms, count, usable)
+
+
+def _repeated(rms_px: Floats, usable: Bools) -> Bools:
+    """Return which frames (F,) show the ground of the reference frame again instead of their own."""
+    usual = float(np.median(rms_px[usable])) if usable.any() else 0.0
+    return np.asarray((usual > COARSE_PX) & (rms_px < REPEATED * usual))
 
 
 def _trust(poses: PoseFit) -> Floats:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import pickle
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import closing
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -23,7 +23,7 @@ from core.ground import FEATURES, GroundTracker, choose_features, ground_mask
 from core.measurements import FrameMeasurement, MeasurementStore, Reference
 from core.prediction import MeasureSetup, nothing_measured, predict_apparent, predict_homography
 from core.progress import CancelToken, Progress, silent
-from core.video import FrameIndex, Luma, frame_index, read_frame, read_frames
+from core.video import Frame, FrameIndex, FramesAhead, Luma, frame_index, read_frame
 from core.workers import Helpers, Order
 
 
@@ -91,12 +91,26 @@ def measure_chunk(
 
     Args:
         before: the last two frames before the chunk, where known; otherwise the chunk finds its own way in.
-        threads: decoder threads, as `read_frames`.
+        threads: decoder threads, as `FramesAhead`.
         index: of the video, where it is known already.
     """
+    with _frames_of(setup, chunk, before, threads, index) as frames:
+        yield from _measured(frames, chunk, measurer, before)
+
+
+def _frames_of(
+    setup: MeasureSetup, chunk: Chunk, before: Sequence[FrameMeasurement], threads: int, index: FrameIndex | None
+) -> FramesAhead:
+    """Return a chunk's frames and, where nothing is known of those before it, some to warm up on."""
+    first = chunk.start if before else max(0, chunk.start - WARM_UP)
+    return FramesAhead(setup.video, first, chunk.stop, threads=threads, index=index)
+
+
+def _measured(
+    frames: Iterable[Frame], chunk: Chunk, measurer: Measurer, before: Sequence[FrameMeasurement]
+) -> Iterator[FrameMeasurement]:
     history = list(before)[-2:]
-    first = chunk.start if history else max(0, chunk.start - WARM_UP)
-    for frame in read_frames(setup.video, first, chunk.stop, threads=threads, index=index):
+    for frame in frames:
         measured = measurer.measure(frame.luma, frame=frame.index, time_s=frame.time_s, before=history)
         history = [*history[-1:], measured]
         if frame.index >= chunk.start:
@@ -134,20 +148,26 @@ def measure(
     done = [] if recording is None else store.measured_frames(recording)
     chunks = missing_chunks(done, index, workers) if scheduler is None else []
     helping = max(0, min(workers, len(chunks)) - 1)
-    with Helpers(measure_order, helping) as helpers:
+    before = [_before(store, recording, chunk.start) for chunk in chunks]
+    threads = 1 if helping else 0
+    with Helpers(measure_order, helping) as helpers, ExitStack() as stack:
+        # Decoding begins while the reference frame is still being looked at.
+        begun = [
+            _frames_of(setup, chunk, known, threads, index) for chunk, known in zip(chunks[:1], before, strict=False)
+        ]
+        for frames in begun:
+            stack.enter_context(frames)
         measurer = make_measurer(setup, None if recording is None else store.reference(recording), index)
         if recording is None:
             recording = store.begin(setup.method, setup.fingerprint, measurer.reference)
         eyes = pickle.dumps(Eyes(setup, index, measurer.reference))
 
         def own(order: Order) -> Iterator[FrameMeasurement]:
-            threads = 1 if helping else 0
-            return measure_chunk(
-                setup, order.chunk, measurer=measurer, before=order.before, threads=threads, index=index
-            )
+            with begun.pop() if begun else _frames_of(setup, order.chunk, order.before, threads, index) as frames:
+                yield from _measured(frames, order.chunk, measurer, order.before)
 
         if scheduler is None:
-            orders = [Order(eyes, chunk, _before(store, recording, chunk.start)) for chunk in chunks]
+            orders = [Order(eyes, chunk, known) for chunk, known in zip(chunks, before, strict=True)]
             source = helpers.measure(orders, own)
         else:
             source = measure_on_cluster(
@@ -168,7 +188,10 @@ def measure(
     return recording
 
 
-def _before(store: MeasurementStore, recording: int, start: int) -> list[FrameMeasurement]:
+def _before(store: MeasurementStore, recording: int | None, start: int) -> list[FrameMeasurement]:
+    """Return the last two frames before one, or none where the last is not known."""
+    if recording is None:
+        return []
     found = [store.frame(recording, frame) for frame in (start - 2, start - 1) if frame >= 0]
     known = [frame for frame in found if frame is not None]
     return known if known and known[-1].frame == start - 1 else []

@@ -25,9 +25,12 @@ Singles = NDArray[np.float32]
 HALF_PX = 10  # patches of 21 x 21 pixels: 400 of them are 0.18 megapixel
 MARGIN_PX = 6  # room for deformation and for the interpolation kernel
 OVERSAMPLING = 2  # linear interpolation between half pixels errs below the noise of 8-bit video
-# Each step leaves about a tenth of its own length; a patch that takes more than a few shows something else.
+# A patch that takes more than a few steps shows something else.
 MAX_ITERATIONS = 4
-SETTLED_PX = 0.02
+# Central differences see fine texture flatter than it is, and take steps too long by a seventh. Of a step shortened by
+# that, what is left is a seventh at most, and nothing that patches have in common (measured on H.264 clips).
+STEP_GAIN = 0.87
+SETTLED_PX = 0.06
 # A patch that wanders further than this from its prediction has lost its own minimum.
 MAX_WANDER_PX = 5.0
 
@@ -188,7 +191,7 @@ def _step(frame: Singles, energy: Floats, template: Singles) -> tuple[Floats, Fl
     safe = np.where(usable, determinant * gain, 1.0)
     du = (H_vv * b_u - H_uv * b_v) / safe
     dv = (H_uu * b_v - H_uv * b_u) / safe
-    step = np.where(usable[:, None], np.clip(-np.stack([du, dv], axis=1), -2.0, 2.0), 0.0)
+    step = np.where(usable[:, None], np.clip(-STEP_GAIN * np.stack([du, dv], axis=1), -2.0, 2.0), 0.0)
     return step, np.where(usable, score, 0.0)
 
 

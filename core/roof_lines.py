@@ -184,21 +184,20 @@ class LineTracker:
         fraction = section.across + expected - np.rint(section.across)
         signature = self.profile.signature
         reach = search + (len(signature) - 1) // 2
-        windows, rounded = np.empty((QUARTERS, 2 * reach + 1)), np.empty(QUARTERS)
-        for number, part in enumerate(np.array_split(np.arange(len(section.along)), QUARTERS)):
-            middle = float(fraction[part].mean())
-            rounded[number] = round(middle) - middle
-            columns = section.half + round(middle) + np.arange(-reach, reach + 1)
-            mean = section.values[part[0] : part[-1] + 1].mean(axis=0)
-            windows[number] = mean[np.clip(columns, 0, len(mean) - 1)]
+        first = np.arange(QUARTERS) * len(fraction) // QUARTERS
+        count = np.diff(first, append=len(fraction))
+        middle = np.add.reduceat(fraction, first) / count
+        columns = section.half + np.rint(middle).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
+        mean = np.add.reduceat(section.values, first, axis=0, dtype=np.float64) / count[:, None]
+        windows = np.take_along_axis(mean, np.clip(columns, 0, mean.shape[1] - 1), axis=1)
         scores = _correlations(windows, signature)
-        score = np.median(scores, axis=0)
+        score = _median_of_quarters(scores)
         shifts = np.arange(-search, search + 1)
         # Among equals the nearest wins; a look-alike must be clearly better to be preferred.
         best = int(np.argmax(score - 0.1 * (shifts / max(search, 1)) ** 2))
         inner = min(max(best, 1), 2 * search - 1)
-        vertex = [np.clip(_vertex(row, inner) - best, -1.0, 1.0) for row in scores]
-        return float(shifts[best] + np.median(vertex + rounded)), float(score[best])
+        vertex = np.clip([_vertex(row, inner) - best for row in scores], -1.0, 1.0)
+        return float(shifts[best] + _median_of_quarters(vertex + np.rint(middle) - middle)), float(score[best])
 
     def _edges(self, section: _Section, offset: float) -> Floats:
         """Return both edges (STATIONS, 2, 2) where the response to a derivative of a Gaussian is extreme."""
@@ -247,6 +246,11 @@ def _correlations(windows: Floats, signature: Singles) -> Floats:
     return np.asarray((pieces @ signature) / np.maximum(norm, 1e-6 + 0.5 * np.sqrt(len(signature))))
 
 
+def _median_of_quarters(values: Floats) -> Floats:
+    """Return the median along the first axis, which has `QUARTERS` places."""
+    return np.asarray(np.sort(values, axis=0)[QUARTERS // 2 - 1 : QUARTERS // 2 + 1].mean(axis=0))
+
+
 def _membership(place: Floats) -> Floats:
     """Return the share (STATIONS, n) of each column that belongs to each station.
 
@@ -279,40 +283,55 @@ def _extremes(
     """
     half = int(np.ceil(3.0 * scale_px)) + 1
     taps = np.arange(-half, half + 1)
-    rows = np.arange(len(section.across))[:, None]
-    last = section.values.shape[1] - 1
+    powers = ((taps[:, None] / scale_px) ** np.arange(5)).astype(np.float32)
+    values, width = section.values.ravel(), section.values.shape[1]
+    rows = np.arange(len(section.across)) * width
     expected = edge - (np.rint(section.across) - section.half)
     shift, pooling = np.zeros((2, STATIONS)), members.astype(np.float32)
     for _ in range(HALLEY_STEPS):
-        position = expected + shift @ members
-        nearest = np.rint(position)
-        index = np.clip(nearest[..., None].astype(np.int64) + taps, 0, last)
-        sample = section.values[rows, index]
-        s = ((nearest - position)[..., None] + taps).astype(np.float32)
-        q = (s / np.float32(scale_px)) ** 2
-        gauss = np.exp(-0.5 * q)
-        # Derivatives of the response, the sum of f(s) s exp(-s^2 / 2 sigma^2), by the position of the kernel.
-        weighted = gauss * sample
-        by_column = np.stack(
-            [
-                np.vecdot(s, weighted),
-                np.vecdot(q - 1.0, weighted),
-                np.vecdot((q - 3.0) * s, weighted) / scale_px**2,
-                np.vecdot((q - 6.0) * q + 3.0, weighted) / scale_px**2,
-                np.vecdot(s * s, gauss),
-            ],
-            axis=-1,
-        ).astype(np.float32)
-        response, first, second, third, power = np.moveaxis((pooling @ by_column).astype(np.float64), -1, 0)
-        strength = slope_sign * response / np.maximum(power, 1e-9)
+        position = expected + shift.astype(np.float32) @ pooling
+        nearest = np.clip(np.rint(position).astype(np.int64), half, width - 1 - half)
+        sample = values.take((rows + nearest)[..., None] + taps)
+        past = ((nearest - position) / scale_px).astype(np.float32)
+        gauss = np.exp(-0.5 * (past[..., None] + powers[:, 1]) ** 2)
+        by_column = _responses(past, _moments(gauss * sample, powers), _moments(gauss, powers[:, :3]))
+        response, first, second, third, power = (by_column @ pooling.T).astype(np.float64)
+        strength = slope_sign * response / np.maximum(power * scale_px, 1e-9)
         curved = second * slope_sign < 0
         denominator = 2.0 * second**2 - first * third
         usable = curved & (denominator > 0.5 * second**2)
         halley = -2.0 * first * second / np.where(usable, denominator, 1.0)
         newton = -first / np.where(curved, second, 1.0)
-        step = np.where(usable, halley, np.where(curved, newton, 0.0))
+        step = np.where(usable, halley, np.where(curved, newton, 0.0)) * scale_px
         shift += np.clip(step, -1.0, 1.0)
     return shift, np.where(curved & (np.abs(step) < 0.05), strength, 0.0)
+
+
+def _moments(weighted: Singles, powers: Singles) -> Singles:
+    """Return the sums (P, 2, n) of weights (2, n, taps) times powers (taps, P)."""
+    sums = weighted.reshape(-1, len(powers)) @ powers
+    return np.ascontiguousarray(sums.T).reshape(-1, *weighted.shape[:2])
+
+
+def _responses(past: Singles, moments: Singles, own: Singles) -> Singles:
+    """Return the response to a derivative of a Gaussian, its three derivatives and the kernel's power, (5, 2, n).
+
+    The response is the sum of f(s) s exp(-s^2 / 2); it and its derivatives by the kernel's position are sums of powers
+    of s, which follow from powers about the nearest pixel. Lengths are in units of the Gaussian's width.
+
+    Args:
+        past: (2, n) how far the nearest pixel lies past the kernel's middle.
+        moments: (5, 2, n) of the Gaussian times the picture, about the nearest pixel, from the zeroth on.
+        own: (3, 2, n) of the Gaussian alone.
+    """
+    m0, m1, m2, m3, m4 = moments
+    p = past
+    s1 = m1 + p * m0
+    s2 = m2 + p * (2 * m1 + p * m0)
+    s3 = m3 + p * (3 * m2 + p * (3 * m1 + p * m0))
+    s4 = m4 + p * (4 * m3 + p * (6 * m2 + p * (4 * m1 + p * m0)))
+    power = own[2] + p * (2 * own[1] + p * own[0])
+    return np.stack([s1, s2 - m0, s3 - 3 * s1, s4 - 6 * s2 + 3 * m0, power])
 
 
 def _find_strip(section: _Section, half_band: int, name: str) -> StripProfile:

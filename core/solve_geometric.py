@@ -55,7 +55,8 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
     calibration = calibrate(evidence)
     used = evidence.corrected(calibration.correction)
     caught_up = replace(recording, ground_raw=recording.ground_raw + used.lag_s * np.nan_to_num(speed))
-    ground = solve_ground(caught_up, used.lens, used.pose0, reference.origin_m, relief)
+    frame0 = project.reference_frame
+    ground = solve_ground(caught_up, used.lens, used.pose0, reference.origin_m, relief, reference_frame=frame0)
     flight, ground = _smoothed(caught_up, ground, used.lens)
     slow_m = calibration_sigma(evidence, calibration)
     targets = {

@@ -14,6 +14,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from types import TracebackType
 from typing import BinaryIO
 
 import av
@@ -173,50 +174,75 @@ def _frame_index(path: File, state: FileState) -> FrameIndex:
     return FrameIndex(ticks=tuple(sorted(ticks)), key_ticks=tuple(sorted(keys)), tick_s=tick_s)
 
 
-def read_frames(
-    path: File, start: int = 0, stop: int | None = None, *, threads: int = 0, index: FrameIndex | None = None
-) -> Iterator[Frame]:
-    """Yield frames `start` to `stop` (exclusive; None for all), decoding ahead in a thread of its own.
+class FramesAhead:
+    """Frames `start` to `stop` (exclusive; None for all), decoded ahead in a thread of its own from now on.
+
+    A context, at whose end the thread is gone.
 
     Args:
         threads: decoder threads, 0 for as many as keep all cores busy while somebody works on the frames.
         index: of the file, where it is known already; read where it is needed and None.
-
-    Raises:
-        InputError: the file cannot be read, or `start` lies beyond its end.
     """
-    threads = threads or min(MOST_THREADS, THREADS_PER_CORE * available_cores())
-    ahead: queue.Queue[Frame | Exception | None] = queue.Queue(maxsize=READ_AHEAD)
-    stopped = threading.Event()
 
-    def hand_over(item: Frame | Exception | None) -> bool:
-        while not stopped.is_set():
+    def __init__(
+        self, path: File, start: int = 0, stop: int | None = None, *, threads: int = 0, index: FrameIndex | None = None
+    ) -> None:
+        self._ahead: queue.Queue[Frame | Exception | None] = queue.Queue(maxsize=READ_AHEAD)
+        self._stopped = threading.Event()
+        threads = threads or min(MOST_THREADS, THREADS_PER_CORE * available_cores())
+        frames = _decoded(path, start, stop, threads, index)
+        self._thread = threading.Thread(target=self._decode, args=(frames,), name="video decoder", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> FramesAhead:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stopped.set()
+        self._thread.join()
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames in order.
+
+        Raises:
+            InputError: the file cannot be read, or `start` lies beyond its end.
+        """
+        while (item := self._ahead.get()) is not None:
+            if isinstance(item, Exception):
+                raise item
+            yield item
+
+    def _decode(self, frames: Iterator[Frame]) -> None:
+        try:
+            for frame in frames:
+                if not self._hand_over(frame):
+                    return
+            self._hand_over(None)
+        except Exception as error:  # handed to the reading thread, which raises it
+            self._hand_over(error)
+
+    def _hand_over(self, item: Frame | Exception | None) -> bool:
+        while not self._stopped.is_set():
             try:
-                ahead.put(item, timeout=0.1)
+                self._ahead.put(item, timeout=0.1)
             except queue.Full:
                 continue
             return True
         return False
 
-    def decode() -> None:
-        try:
-            for frame in _decoded(path, start, stop, threads, index):
-                if not hand_over(frame):
-                    return
-            hand_over(None)
-        except Exception as error:  # handed to the reading thread, which raises it
-            hand_over(error)
 
-    thread = threading.Thread(target=decode, name="video decoder", daemon=True)
-    thread.start()
-    try:
-        while (item := ahead.get()) is not None:
-            if isinstance(item, Exception):
-                raise item
-            yield item
-    finally:
-        stopped.set()
-        thread.join()
+def read_frames(
+    path: File, start: int = 0, stop: int | None = None, *, threads: int = 0, index: FrameIndex | None = None
+) -> Iterator[Frame]:
+    """Yield frames `start` to `stop`; see `FramesAhead`.
+
+    Raises:
+        InputError: the file cannot be read, or `start` lies beyond its end.
+    """
+    with FramesAhead(path, start, stop, threads=threads, index=index) as frames:
+        yield from frames
 
 
 def read_frame(path: File, number: int, *, index: FrameIndex | None = None) -> Frame:

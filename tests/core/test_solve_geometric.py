@@ -112,6 +112,31 @@ def _equally_weighted_error(recording: Recording, centre_m: Floats, project: Pro
     return float(np.abs(equal.centre_m - centre_m).mean())
 
 
+# --- frames whose ground is a repetition ------------------------------------------------------------------------------
+
+
+def test_frames_that_repeat_the_ground_of_the_reference_frame_are_lost() -> None:
+    recording = scene.recording(0.3)
+    ground = recording.ground_raw.copy()
+    repeated = slice(1, 6)
+    ground[0] = recording.reference.ground_raw
+    ground[repeated] = recording.reference.ground_raw + 0.02 * np.sin(np.arange(5))[:, None, None]
+    history = solved(replace(recording, ground_raw=ground)).histories["roof"]
+    assert (history.status[repeated] == Status.LOST).all()
+    assert np.isnan(history.p1_m[repeated]).all()
+    # The reference frame itself is no repetition, and what follows is measured.
+    assert (np.delete(history.status, np.arange(1, 6)) != Status.LOST).all()
+
+
+def test_a_clean_view_like_the_reference_frame_is_no_repetition() -> None:
+    recording = scene.recording(0.05)
+    ground = recording.ground_raw.copy()
+    true = scene.recording().ground_raw
+    ground[:20] = true[:20] + 1e-4
+    history = solved(replace(recording, ground_raw=ground)).histories["roof"]
+    assert (history.status == Status.OK).all()
+
+
 # --- self-calibration ------------------------------------------------------------------------------------------------
 
 
