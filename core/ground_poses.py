@@ -19,8 +19,8 @@ LEAST_GROUND = 20
 LEAST_SCATTER = 0.3
 # Least scatter of ground points at which outliers are told, pixels.
 LEAST_SIGMA_PX = 0.01
-# A starved encoder repeats the ground of a key frame in the frames that follow, while strips go on moving. Where features
-# usually scatter by more than the first, pixels, a scatter below this part of it is no view of its own.
+# A starved encoder repeats the ground of a key frame in the frames that follow, while strips go on moving. Where
+# features usually scatter by more than the first, pixels, a scatter below this part of it is no view of its own.
 COARSE_PX = 0.15
 REPEATED = 0.45
 
