@@ -20,6 +20,8 @@ from core.video import FrameIndex
 WARM_UP = 8
 # A chunk is never shorter: finding the way in costs about as much as measuring ten frames.
 LEAST_FRAMES = 30
+# Frames that a process measures while those that help it are still loading.
+HEAD_START = 18
 
 
 @dataclass(frozen=True)
@@ -30,12 +32,19 @@ class Chunk:
     stop: int
 
 
-def missing_chunks(done: Sequence[int], index: FrameIndex, parts: int) -> list[Chunk]:
-    """Return what is left to measure of a video, cut into about `parts` equal parts."""
+def missing_chunks(done: Sequence[int], index: FrameIndex, parts: int, head_start: int = 0) -> list[Chunk]:
+    """Return what is left to measure of a video, cut into about `parts` equal parts.
+
+    Args:
+        head_start: by how many frames the first part is longer.
+    """
     gaps = missing_frames(done, len(index))
     left = sum(gap.stop - gap.start for gap in gaps)
     share = max(LEAST_FRAMES, -(-left // parts))
-    return [chunk for gap in gaps for chunk in _cut(gap, max(1, round((gap.stop - gap.start) / share)), index)]
+    chunks: list[Chunk] = []
+    for gap in gaps:
+        chunks += _cut(gap, max(1, round((gap.stop - gap.start) / share)), index, 0 if chunks else head_start)
+    return chunks
 
 
 def missing_frames(done: Sequence[int], total: int) -> list[Chunk]:
@@ -46,13 +55,13 @@ def missing_frames(done: Sequence[int], total: int) -> list[Chunk]:
     return [Chunk(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
-def _cut(gap: Chunk, parts: int, index: FrameIndex) -> list[Chunk]:
+def _cut(gap: Chunk, parts: int, index: FrameIndex, head_start: int) -> list[Chunk]:
     """Cut a stretch where decoding can begin with few frames for nothing, as near to equal parts as that allows."""
     keys = index.key_frames
     length = gap.stop - gap.start
     cuts = {gap.start, gap.stop}
     for number in range(1, parts):
-        wanted = gap.start + number * length // parts
+        wanted = gap.start + head_start + number * (length - head_start) // parts
         after = bisect_right(keys, wanted - WARM_UP)
         convenient = [key + WARM_UP for key in keys[max(0, after - 1) : after + 1]]
         possible = [cut for cut in (wanted, *convenient) if gap.start < cut < gap.stop]

@@ -21,7 +21,7 @@ from core.patches import HALF_PX, MARGIN_PX, Matches, PatchTracker
 from core.video import Luma
 
 # More give no better pose: what compression gets wrong, it gets wrong for all of them alike.
-FEATURES = 220
+FEATURES = 180
 # Correlation below which a patch shows something else than in the reference frame.
 LEAST_SCORE = 0.6
 # Ground points needed before a frame's homography is believed.
@@ -229,9 +229,6 @@ class CameraFinder:
         kept = cv2.resize(allowed.astype(np.uint8), self._small_size, interpolation=cv2.INTER_NEAREST)
         self._allowed0: Luma = np.asarray(kept, dtype=np.uint8)
         self._small0 = self._reduced(luma)
-        # OpenCV's detectors differ in their defaults from build to build, so they are written out.
-        self._detector = cv2.SIFT.create(nfeatures=1500, contrastThreshold=0.02)
-        self._matcher = cv2.BFMatcher(cv2.NORM_L2)
 
     @cached_property
     def _features0(self) -> tuple[Floats, NDArray[np.float32]]:
@@ -244,7 +241,8 @@ class CameraFinder:
         points, descriptors = self._detect(self._reduced(luma), None)
         if len(points) < LEAST_POINTS or len(points0) < LEAST_POINTS:
             return None
-        pairs = [m for m in self._matcher.knnMatch(descriptors, descriptors0, k=2) if len(m) == 2]
+        both = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors, descriptors0, k=2)
+        pairs = [m for m in both if len(m) == 2]
         kept = [(m.queryIdx, m.trainIdx) for m, second in pairs if m.distance < 0.8 * second.distance]
         if len(kept) < LEAST_POINTS:
             return None
@@ -258,7 +256,9 @@ class CameraFinder:
         return np.asarray(cv2.resize(luma, self._small_size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def _detect(self, small: Luma, mask: Luma | None) -> tuple[Floats, NDArray[np.float32]]:
-        keypoints, descriptors = self._detector.detectAndCompute(small, mask)
+        # OpenCV's detectors differ in their defaults from build to build, so they are written out.
+        detector = cv2.SIFT.create(nfeatures=1500, contrastThreshold=0.02)
+        keypoints, descriptors = detector.detectAndCompute(small, mask)
         if not keypoints:
             return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
         scale = np.array(self._size) / np.array(self._small_size)

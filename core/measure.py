@@ -16,7 +16,7 @@ from typing import Protocol
 
 import cv2
 
-from core.chunks import WARM_UP, Chunk, missing_chunks
+from core.chunks import HEAD_START, WARM_UP, Chunk, missing_chunks
 from core.cluster import measure_on_cluster
 from core.following import CONFIRM_EVERY, make_follower
 from core.ground import FEATURES, GroundTracker, choose_features, ground_mask
@@ -36,14 +36,21 @@ class Measurer(Protocol):
         """Return what a frame shows; `before` holds up to two frames that precede it, the nearest last."""
 
 
-def make_measurer(setup: MeasureSetup, reference: Reference | None = None, index: FrameIndex | None = None) -> Measurer:
+def make_measurer(
+    setup: MeasureSetup,
+    reference: Reference | None = None,
+    index: FrameIndex | None = None,
+    luma: Luma | None = None,
+) -> Measurer:
     """Return the measurer of the setup's method, its eyes on the reference frame.
 
     Args:
         reference: of an earlier recording, to go on with exactly its features; chosen anew where None.
         index: of the video, where it is known already.
+        luma: the reference frame, where it is at hand; read where None.
     """
-    luma = read_frame(setup.video, setup.reference_frame, index=index).luma
+    if luma is None:
+        luma = read_frame(setup.video, setup.reference_frame, index=index).luma
     if setup.method == "paper":
         # Brings a library along that takes a while to load.
         from core.paper import PaperMeasurer
@@ -106,6 +113,12 @@ def _frames_of(
     return FramesAhead(setup.video, first, chunk.stop, threads=threads, index=index)
 
 
+def _reference_among(begun: Sequence[FramesAhead], setup: MeasureSetup) -> Luma | None:
+    """Return the reference frame if decoding has begun with it, so that it need not be decoded twice."""
+    first = next((frames.first() for frames in begun if frames.start == setup.reference_frame), None)
+    return None if first is None else first.luma
+
+
 def _measured(
     frames: Iterable[Frame], chunk: Chunk, measurer: Measurer, before: Sequence[FrameMeasurement]
 ) -> Iterator[FrameMeasurement]:
@@ -146,21 +159,21 @@ def measure(
         return recording
     index = frame_index(setup.video)
     done = [] if recording is None else store.measured_frames(recording)
-    chunks = missing_chunks(done, index, workers) if scheduler is None else []
+    chunks = missing_chunks(done, index, workers, HEAD_START) if scheduler is None else []
     helping = max(0, min(workers, len(chunks)) - 1)
     before = [_before(store, recording, chunk.start) for chunk in chunks]
     threads = 1 if helping else 0
     with Helpers(measure_order, helping) as helpers, ExitStack() as stack:
         # Decoding begins while the reference frame is still being looked at.
         begun = [
-            _frames_of(setup, chunk, known, threads, index) for chunk, known in zip(chunks[:1], before, strict=False)
+            stack.enter_context(_frames_of(setup, chunk, known, threads, index))
+            for chunk, known in zip(chunks[:1], before, strict=False)
         ]
-        for frames in begun:
-            stack.enter_context(frames)
-        measurer = make_measurer(setup, None if recording is None else store.reference(recording), index)
+        reference = None if recording is None else store.reference(recording)
+        measurer = make_measurer(setup, reference, index, _reference_among(begun, setup))
         if recording is None:
             recording = store.begin(setup.method, setup.fingerprint, measurer.reference)
-        eyes = pickle.dumps(Eyes(setup, index, measurer.reference))
+        eyes = pickle.dumps(Eyes(setup, index, measurer.reference, measurer if helping else None))
 
         def own(order: Order) -> Iterator[FrameMeasurement]:
             with begun.pop() if begun else _frames_of(setup, order.chunk, order.before, threads, index) as frames:
@@ -199,11 +212,17 @@ def _before(store: MeasurementStore, recording: int | None, start: int) -> list[
 
 @dataclass(frozen=True)
 class Eyes:
-    """What all chunks of a video have in common, sent to whoever measures them."""
+    """What all chunks of a video have in common, sent to whoever measures them.
+
+    Attributes:
+        measurer: ready to measure, for those who sit near; None where its megabyte has too far to go, and the reference
+            frame is read again instead.
+    """
 
     setup: MeasureSetup
     index: FrameIndex
     reference: Reference
+    measurer: Measurer | None = None
 
 
 class _Kept(threading.local):
@@ -223,7 +242,8 @@ def measure_order(order: Order) -> Iterator[FrameMeasurement]:
     cv2.setNumThreads(1)
     if _kept.packed != order.eyes:
         _kept.eyes = pickle.loads(order.eyes)
-        _kept.measurer = make_measurer(_kept.eyes.setup, _kept.eyes.reference, _kept.eyes.index)
+        eyes = _kept.eyes
+        _kept.measurer = eyes.measurer or make_measurer(eyes.setup, eyes.reference, eyes.index)
         _kept.packed = order.eyes
     yield from measure_chunk(
         _kept.eyes.setup,

@@ -13,6 +13,7 @@ Extraction"; SIFT (Lowe 2004) stands for SURF, which OpenCV's packages do not ca
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -52,6 +53,10 @@ STATIONS = 500
 LEAST_STATIONS = 40
 
 
+# Places (M, 2) of features in raw pixels, their descriptors (M, 128), and the candidates for each expected feature.
+_Seen = tuple[Floats, NDArray[np.float32], list[NDArray[np.int64]]]
+
+
 class PaperMeasurer:
     """Measures frames the published way; see `core.measure.Measurer`."""
 
@@ -80,8 +85,7 @@ class SiftGround:
 
     def __init__(self, luma: Luma, lens: Lens, allowed: NDArray[np.bool_]) -> None:
         self._lens = lens
-        self._sift = cv2.SIFT.create(nfeatures=0, contrastThreshold=0.02)
-        keypoints, descriptors = self._sift.detectAndCompute(luma, allowed.astype(np.uint8))
+        keypoints, descriptors = _sift().detectAndCompute(luma, allowed.astype(np.uint8))
         kept = _spread_strongest(keypoints, luma.shape, FEATURES)
         if len(kept) < LEAST_MATCHES:
             raise InputError(
@@ -111,19 +115,14 @@ class SiftGround:
 
     def _match(self, luma: Luma, expected_raw: Floats) -> Floats:
         """Return each feature's match (N, 2) among those found within the window around its expected place."""
-        side = 2 * WINDOW_PX
-        if luma.size > 1.5 * len(expected_raw) * side**2:
-            places, descriptors, index = self._seen_in_windows(luma, expected_raw)
-        else:
-            places, descriptors = self._detect(luma, _around(luma.shape, expected_raw))
-            index = np.arange(len(expected_raw))
-        candidates: Any = cKDTree(places).query_ball_point(np.nan_to_num(expected_raw[index], nan=-1e6), NEAR_PX)
+        windows = len(expected_raw) * (2 * WINDOW_PX) ** 2
+        look = self._seen_in_windows if luma.size > 1.5 * windows else self._seen_in_all
+        places, descriptors, candidates = look(luma, expected_raw)
         matched = np.full_like(expected_raw, np.nan)
-        for number, near in zip(index.tolist(), candidates, strict=True):
-            if near:
-                best = self._best(number, descriptors[near])
-                if best is not None:
-                    matched[number] = places[near[best]]
+        for number, near in enumerate(candidates):
+            best = self._best(number, descriptors[near]) if len(near) else None
+            if best is not None:
+                matched[number] = places[near[best]]
         return matched
 
     def _best(self, number: int, descriptors: NDArray[np.float32]) -> int | None:
@@ -136,29 +135,39 @@ class SiftGround:
 
     def _detect(self, picture: Luma, near: Luma) -> tuple[Floats, NDArray[np.float32]]:
         """Return the features of a picture where `near` is not zero, and their descriptors; the others get none."""
-        keypoints, descriptors = self._sift.detectAndCompute(picture, near)
+        keypoints, descriptors = _sift().detectAndCompute(picture, near)
         if not keypoints:
             return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
         return np.array([keypoint.pt for keypoint in keypoints]), np.asarray(descriptors, dtype=np.float32)
 
-    def _seen_in_windows(
-        self, luma: Luma, expected_raw: Floats
-    ) -> tuple[Floats, NDArray[np.float32], NDArray[np.int64]]:
-        """Return what SIFT finds in the windows alone, laid side by side, and which features have a window."""
+    def _seen_in_all(self, luma: Luma, expected_raw: Floats) -> _Seen:
+        """Return what SIFT finds in the whole frame, and for each expected feature what lies near it."""
+        places, descriptors = self._detect(luma, _around(luma.shape, expected_raw))
+        near: Any = cKDTree(places).query_ball_point(np.nan_to_num(expected_raw, nan=-1e6), NEAR_PX)
+        return places, descriptors, [np.array(each, dtype=np.int64) for each in near]
+
+    def _seen_in_windows(self, luma: Luma, expected_raw: Floats) -> _Seen:
+        """Return what SIFT finds in the windows alone, laid side by side, and for each expected feature its own."""
         windows, corners, index = _windows(luma, expected_raw)
         if not windows:
-            return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32), index
+            return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32), []
         side = 2 * WINDOW_PX
         columns = int(np.ceil(np.sqrt(len(windows))))
         mosaic = _mosaic(windows, columns)
         middles = np.stack(np.divmod(np.arange(len(windows)), columns)[::-1], axis=1) * side + WINDOW_PX
         places, descriptors = self._detect(mosaic, _around(mosaic.shape, middles))
         tile = (places // side).astype(np.int64)
-        number = tile[:, 1] * columns + tile[:, 0]
-        # Near the seams a feature sees its neighbour in the mosaic, not in the frame.
-        whole = (number < len(windows)) & (np.abs(places % side - WINDOW_PX).max(axis=1, initial=0.0) < NEAR_PX)
-        own = places[whole] % side + corners[number[whole]]
-        return own, descriptors[whole], index
+        number = np.minimum(tile[:, 1] * columns + tile[:, 0], len(windows) - 1)
+        own = places - tile * side + corners[number]
+        # What two windows share is found in both, and is a candidate only once for each.
+        near = np.linalg.norm(own - expected_raw[index[number]], axis=1) < NEAR_PX
+        order = np.flatnonzero(near)[np.argsort(index[number[near]], kind="stable")]
+        ends = np.searchsorted(index[number[order]], np.arange(len(expected_raw) + 1))
+        return own, descriptors, [order[first:last] for first, last in itertools.pairwise(ends)]
+
+
+def _sift() -> cv2.SIFT:
+    return cv2.SIFT.create(nfeatures=0, contrastThreshold=0.02)
 
 
 def _spread_strongest(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...], count: int) -> list[int]:

@@ -12,6 +12,7 @@ Source: Lucas & Kanade (1981); Baker & Matthews (2004) for the forward-additive 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -59,7 +60,19 @@ class PatchTracker:
     def __init__(self, luma: Luma, points_raw: Floats) -> None:
         self.points_raw = np.array(points_raw, dtype=np.float64).reshape(-1, 2)
         self._anchor = np.rint(self.points_raw).astype(np.int64)
-        self._mosaic, self._tile_origin = _oversampled_tiles(luma, self._anchor)
+        self._tiles = _cut_out(luma, self._anchor - HALF_PX - MARGIN_PX, 2 * (HALF_PX + MARGIN_PX) + 1)
+        self._lay_out()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what the tiles say already: this travels to other processes."""
+        return {name: getattr(self, name) for name in ("points_raw", "_anchor", "_tiles")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        self._mosaic, self._tile_origin = _oversampled(self._tiles)
         side = np.arange(-HALF_PX - 1, HALF_PX + 2, dtype=np.float64)
         u, v = np.meshgrid(side, side)
         self._grid = np.stack([u.ravel(), v.ravel(), np.ones(u.size)]).astype(np.float32)
@@ -82,7 +95,7 @@ class PatchTracker:
         index = np.flatnonzero(inside)
         if not len(index):
             return Matches(raw, score)
-        pixels = _cut_out(luma, corner[index], size)
+        pixels = _cut_out(luma, corner[index], size).astype(np.float32)
         found, score[index] = self._align(index, pixels, predicted_raw[index], ref_from_current[index])
         wandered = np.abs(found - predicted_raw[index]).max(axis=1) > MAX_WANDER_PX
         found[wandered], score[index[wandered]] = np.nan, np.nan
@@ -136,15 +149,14 @@ class PatchTracker:
         return np.asarray(sampled, dtype=np.float32).reshape(len(index), side, side)
 
 
-def _oversampled_tiles(luma: Luma, anchor: NDArray[np.int64]) -> tuple[Singles, Floats]:
-    """Return one mosaic of oversampled patches and the mosaic coordinates (N, 2) of each patch's centre."""
-    size = 2 * (HALF_PX + MARGIN_PX) + 1
-    tile = size * OVERSAMPLING
-    columns = max(1, int(np.ceil(np.sqrt(len(anchor)))))
-    rows = max(1, -(-len(anchor) // columns))
+def _oversampled(tiles: Luma) -> tuple[Singles, Floats]:
+    """Return one mosaic of oversampled tiles (N, size, size) and the mosaic coordinates (N, 2) of each one's centre."""
+    tile = tiles.shape[1] * OVERSAMPLING
+    columns = max(1, int(np.ceil(np.sqrt(len(tiles)))))
+    rows = max(1, -(-len(tiles) // columns))
     mosaic = np.zeros((rows * tile, columns * tile), dtype=np.float32)
-    origin = np.empty((len(anchor), 2))
-    for number, patch in enumerate(_cut_out(luma, anchor - HALF_PX - MARGIN_PX, size)):
+    origin = np.empty((len(tiles), 2))
+    for number, patch in enumerate(tiles.astype(np.float32)):
         top, left = (number // columns) * tile, (number % columns) * tile
         large = cv2.resize(patch, (tile, tile), interpolation=cv2.INTER_LANCZOS4)
         mosaic[top : top + tile, left : left + tile] = large
@@ -154,11 +166,9 @@ def _oversampled_tiles(luma: Luma, anchor: NDArray[np.int64]) -> tuple[Singles, 
     return mosaic, origin
 
 
-def _cut_out(luma: Luma, corner: NDArray[np.int64], size: int) -> Singles:
-    patches = np.empty((len(corner), size, size), dtype=np.float32)
-    for number, (left, top) in enumerate(corner.tolist()):
-        patches[number] = luma[top : top + size, left : left + size]
-    return patches
+def _cut_out(luma: Luma, corner: NDArray[np.int64], size: int) -> Luma:
+    windows = np.lib.stride_tricks.sliding_window_view(luma, (size, size))
+    return windows[corner[:, 1], corner[:, 0]]
 
 
 def _step(frame: Singles, energy: Floats, template: Singles) -> tuple[Floats, Floats]:

@@ -257,11 +257,15 @@ def _membership(place: Floats) -> Floats:
     A column on the border between two stations belongs to both: where it lies is predicted, and what is measured must
     not jump with the last digit of a prediction.
     """
-    half = 0.5 * abs(place[-1] - place[0]) / max(len(place) - 1, 1)
-    borders = np.arange(STATIONS + 1)[:, None] / STATIONS
-    borders[0], borders[-1] = -np.inf, np.inf
-    covered = np.clip(borders, place - half, place + half)
-    return np.diff(covered, axis=0) / (2.0 * half)
+    n = np.arange(len(place))
+    width = STATIONS * abs(place[-1] - place[0]) / max(len(place) - 1, 1)
+    low = STATIONS * place - 0.5 * width
+    first, second = (np.clip(np.floor(end), 0, STATIONS - 1).astype(np.int64) for end in (low, low + width))
+    beyond = np.where(second > first, (low + width - second) / width, 0.0)
+    share = np.zeros((STATIONS, len(place)))
+    share[first, n] = 1.0 - beyond
+    share[second, n] += beyond
+    return share
 
 
 def _extremes(

@@ -6,6 +6,7 @@ order from 0; times are seconds since the first presented frame. Edit lists and 
 
 from __future__ import annotations
 
+import itertools
 import os
 import queue
 import threading
@@ -182,12 +183,17 @@ class FramesAhead:
     Args:
         threads: decoder threads, 0 for as many as keep all cores busy while somebody works on the frames.
         index: of the file, where it is known already; read where it is needed and None.
+
+    Attributes:
+        start: number of the first frame.
     """
 
     def __init__(
         self, path: File, start: int = 0, stop: int | None = None, *, threads: int = 0, index: FrameIndex | None = None
     ) -> None:
+        self.start = start
         self._ahead: queue.Queue[Frame | Exception | None] = queue.Queue(maxsize=READ_AHEAD)
+        self._seen: list[Frame] = []
         self._stopped = threading.Event()
         threads = threads or min(MOST_THREADS, THREADS_PER_CORE * available_cores())
         frames = _decoded(path, start, stop, threads, index)
@@ -203,12 +209,24 @@ class FramesAhead:
         self._stopped.set()
         self._thread.join()
 
+    def first(self) -> Frame | None:
+        """Return the first frame before any is yielded, or None if there is none; it will be yielded all the same.
+
+        Raises:
+            InputError: as when they are yielded.
+        """
+        if not self._seen:
+            self._seen = list(itertools.islice(self, 1))
+        return self._seen[0] if self._seen else None
+
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames in order.
 
         Raises:
             InputError: the file cannot be read, or `start` lies beyond its end.
         """
+        while self._seen:
+            yield self._seen.pop()
         while (item := self._ahead.get()) is not None:
             if isinstance(item, Exception):
                 raise item

@@ -22,9 +22,10 @@ def covered(chunks):
     spacing=some.integers(1, 300),
     parts=some.integers(1, 9),
     done=some.sets(some.integers(0, 699), max_size=40),
+    head_start=some.integers(0, 40),
 )
-def test_every_missing_frame_is_measured_once(total, spacing, parts, done):
-    chunks = missing_chunks(sorted(done), index_of(total, range(0, total, spacing)), parts)
+def test_every_missing_frame_is_measured_once(total, spacing, parts, done, head_start):
+    chunks = missing_chunks(sorted(done), index_of(total, range(0, total, spacing)), parts, head_start)
     assert covered(chunks) == [frame for frame in range(total) if frame not in done]
     assert all(chunk.start < chunk.stop for chunk in chunks)
 
@@ -32,6 +33,12 @@ def test_every_missing_frame_is_measured_once(total, spacing, parts, done):
 def test_a_chunk_warms_up_from_a_key_frame_where_one_is_near():
     chunks = missing_chunks([], index_of(900, range(0, 900, 30)), 2)
     assert chunks == [Chunk(0, 450 + WARM_UP), Chunk(450 + WARM_UP, 900)]
+
+
+def test_who_begins_at_once_gets_the_longer_part():
+    every = index_of(300, range(300))
+    assert missing_chunks([], every, 2, head_start=20) == [Chunk(0, 160), Chunk(160, 300)]
+    assert missing_chunks([], every, 3, head_start=30) == [Chunk(0, 120), Chunk(120, 210), Chunk(210, 300)]
 
 
 def test_parts_stay_equal_where_key_frames_are_rare():

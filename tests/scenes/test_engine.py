@@ -271,7 +271,7 @@ def test_a_chunk_may_begin_anywhere(clip, history, tmp_path, monkeypatch):
     # In the black, right behind it, in the strongest shaking, and where no key frame is near.
     edges = [0, 41, int(black[1]), int(black[-1]) + 2, int(black[-1]) + 12, 133, ALL_FRAMES]
     chunks = [Chunk(start, stop) for start, stop in itertools.pairwise(edges)]
-    monkeypatch.setattr(measuring, "missing_chunks", lambda done, index, parts: chunks)
+    monkeypatch.setattr(measuring, "missing_chunks", lambda done, index, parts, head_start: chunks)
     folder = project_copy(clip, tmp_path / "pieces")
     assert largest_difference_m(measured_history(folder, workers=2), history) < SAME_M
 

@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from core import paper
+from core.paper import SiftGround
+from tests import exact_scene as scene
+
+SIZE = (1000, 750)
+COUNT = 150
+
+
+def ground_picture(seed: int) -> np.ndarray:
+    """Texture of several scales, denser than the windows are apart: neighbours share what they see."""
+    rng = np.random.default_rng(seed)
+    layers = [
+        cv2.resize(rng.normal(size=(SIZE[1] // step + 1, SIZE[0] // step + 1)), SIZE, interpolation=cv2.INTER_CUBIC)
+        for step in (3, 6, 15)
+    ]
+    picture = sum(layer / layer.std() for layer in layers)
+    return np.clip(128 + 22 * picture, 0, 255).astype(np.uint8)
+
+
+def test_windows_find_the_matches_that_the_whole_frame_gives(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(paper, "FEATURES", COUNT)
+    luma = ground_picture(1)
+    ground = SiftGround(luma, scene.LENS, np.ones(luma.shape, dtype=bool))
+    shift = np.array([1.0, -2.0])
+    moved = np.roll(luma, (-2, 1), axis=(0, 1))
+    assert luma.size > 1.5 * COUNT * (2 * paper.WINDOW_PX) ** 2, "the frame must be large enough for windows"
+    expected = ground.points_raw + shift + 0.4
+    in_windows = ground._match(moved, expected)
+    monkeypatch.setattr(SiftGround, "_seen_in_windows", SiftGround._seen_in_all)
+    in_all = ground._match(moved, expected)
+    margin = paper.WINDOW_PX + 5
+    inside = ((expected > margin) & (expected < np.array(SIZE) - margin)).all(axis=1)
+    found = np.isfinite(in_all).all(axis=1) & inside
+    assert found.sum() > 60
+    assert np.isfinite(in_windows[found]).all(axis=1).mean() > 0.9
+    both = found & np.isfinite(in_windows).all(axis=1)
+    np.testing.assert_allclose(in_windows[both], in_all[both], atol=0.1)
+    np.testing.assert_allclose(np.median(in_windows[both] - ground.points_raw[both], axis=0), shift, atol=0.02)
