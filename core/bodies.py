@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -18,6 +18,10 @@ def world_points(raw: Floats, lens: Lens, poses: PoseFit | Pose, z_m: float) -> 
     rays = lens.rays_from_raw(raw)
     flat = rays.reshape(len(rays), -1, 2)
     return intersect_height(poses.R, poses.centre_m, flat, z_m).reshape(rays.shape)
+
+
+# Frames fitted at a time; what scatter is usual is told from them.
+BATCH = 1024
 
 
 @dataclass(frozen=True)
@@ -42,17 +46,26 @@ class RestBody:
         Args:
             still: (F,) frames from which lasting departures of a strip from a straight line are learnt.
         """
-        weight = np.ones(points.shape[:-1])
-        if self.points is not None:
-            return rigid_from_points(points, weight, self.points, self.centre)
-        assert self.lines is not None
-        fit = rigid_from_lines(points, weight, self.lines)
-        if still.sum() < 10:
-            return fit
-        residual = fit.residual[still]
+        if self.points is not None or still.sum() < 10:
+            return self._fit(points, None)
+        residual = self._fit(points, None).residual[still]
         seen = np.isfinite(residual).sum(axis=0) >= 5
         pattern = np.where(seen, np.nanmedian(np.where(seen, residual, 0.0), axis=0), 0.0)
-        return rigid_from_lines(points, weight, self.lines, pattern=np.nan_to_num(pattern))
+        return self._fit(points, np.nan_to_num(pattern))
+
+    def _fit(self, points: Floats, pattern: Floats | None) -> RigidFit:
+        """Fit some frames at a time, since a fit takes many times the memory of its points."""
+        fits = []
+        for first in range(0, max(len(points), 1), BATCH):
+            some = points[first : first + BATCH]
+            weight = np.ones(some.shape[:-1])
+            if self.lines is not None:
+                fits.append(rigid_from_lines(some, weight, self.lines, pattern=pattern))
+            else:
+                assert self.points is not None
+                fits.append(rigid_from_points(some, weight, self.points, self.centre))
+        columns = zip(*([getattr(fit, each.name) for each in fields(fit)] for fit in fits), strict=True)
+        return RigidFit(*(np.concatenate(column) for column in columns))
 
     def fit_with(self, points: Floats, weight: Floats) -> RigidFit:
         """Return the motion of F frames from points weighted as given; smooth in the points."""

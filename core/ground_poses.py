@@ -17,6 +17,8 @@ from core.solution import Ground
 LEAST_GROUND = 20
 # No ground feature is believed to be steadier than this part of the usual one.
 LEAST_SCATTER = 0.3
+# Frames, evenly spread, that say how steady a feature is.
+TRUST_FRAMES = 1000
 # Least scatter of ground points at which outliers are told, pixels.
 LEAST_SIGMA_PX = 0.01
 # A starved encoder repeats the ground of a key frame in the frames that follow, while strips go on moving. Where
@@ -93,7 +95,8 @@ def _trust(poses: PoseFit) -> Floats:
 
     One corner keeps its place to a thirtieth of a pixel in all frames, another, on grass, to half a pixel.
     """
-    own = poses.residual - finite_median(np.moveaxis(poses.residual, 0, -1))
+    residual = poses.residual[:: max(1, len(poses.residual) // TRUST_FRAMES)]
+    own = residual - finite_median(np.moveaxis(residual, 0, -1))
     sigma = 1.4826 * finite_median(np.moveaxis(np.abs(own), 1, 0).reshape(own.shape[1], -1))
     known = sigma > 0
     usual = float(np.median(sigma[known])) if known.any() else 1.0

@@ -24,6 +24,8 @@ from core.storage import File
 # Newton's method doubles the number of right digits: after a step this small the ray is exact in float64.
 _LAST_STEP = 1e-9
 _MAX_STEPS = 40
+# Points undistorted at a time: what they need besides themselves stays small, and near the processor.
+_BLOCK = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -137,10 +139,16 @@ class Lens:
         if not np.any(self.distortion):
             return distorted
         flat = distorted.reshape(-1, 2)
-        target_x, target_y = flat[:, 0].copy(), flat[:, 1].copy()
+        rays = np.empty_like(flat)
+        for first in range(0, len(flat), _BLOCK):
+            rays[first : first + _BLOCK] = self._undistorted(flat[first : first + _BLOCK])
+        return rays.reshape(raw.shape)
+
+    def _undistorted(self, distorted: Floats) -> Floats:
+        target_x, target_y = distorted[:, 0].copy(), distorted[:, 1].copy()
         x, y = target_x.copy(), target_y.copy()
-        rays = np.full(flat.shape, np.nan)
-        open_points = np.arange(len(flat))
+        rays = np.full(distorted.shape, np.nan)
+        open_points = np.arange(len(distorted))
         limit = 2.0 * min(self.valid_radius, 1e6)
         for _ in range(_MAX_STEPS):
             with np.errstate(all="ignore"):
@@ -156,7 +164,7 @@ class Lens:
             if not going.all():
                 open_points = open_points[going]
                 x, y, target_x, target_y = x[going], y[going], target_x[going], target_y[going]
-        return rays.reshape(raw.shape)
+        return rays
 
     def und_from_rays(self, rays: ArrayLike) -> Floats:
         """Return undistorted pixels (..., 2) of rays (..., 2)."""

@@ -25,6 +25,7 @@ from core.project import Project, Target
 from core.relief import Relief
 from core.results import Status, TargetHistory
 from core.row_times import Readout, at_frame_times, estimated_readout, ground_speed
+from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution, TargetSolution, frame_status
 from core.uncertainty import GROUND_PART, Sigma, combined_sigma, common_error
 
@@ -51,14 +52,11 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
     speed = ground_speed(recording, lens)
     readout = _readout(recording, speed, start, reference, relief)
     recording = at_frame_times(recording, lens, readout.readout_s, speed)
-    evidence = Evidence.of(recording, speed, project, start, reference, relief)
-    calibration = calibrate(evidence)
-    used = evidence.corrected(calibration.correction)
+    calibration, used, slow_m = _calibrated(Evidence.of(recording, speed, project, start, reference, relief))
     caught_up = replace(recording, ground_raw=recording.ground_raw + used.lag_s * np.nan_to_num(speed))
     frame0 = project.reference_frame
     ground = solve_ground(caught_up, used.lens, used.pose0, reference.origin_m, relief, reference_frame=frame0)
     flight, ground = _smoothed(caught_up, ground, used.lens)
-    slow_m = calibration_sigma(evidence, calibration)
     targets = {
         target.name: _solve_target(
             recording,
@@ -110,6 +108,12 @@ def _readout(
     moved = fit_poses(rays, poses.weight, ground.points_m, poses, iterations=3, robust=False)
     change = (moved.residual - poses.residual) / READOUT_STEP_S
     return estimated_readout(poses.residual, change, np.where(ground.usable[:, None], poses.weight, 0.0))
+
+
+def _calibrated(evidence: Evidence) -> tuple[SelfCalibration, Calibration, dict[str, Floats]]:
+    """Return the corrections, what they make of the calibration, and what its uncertainty moves targets by."""
+    found = calibrate(evidence)
+    return found, evidence.corrected(found.correction), calibration_sigma(evidence, found)
 
 
 def _smoothed(recording: Recording, ground: Ground, lens: Lens) -> tuple[SmoothFlight | None, Ground]:

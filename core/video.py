@@ -6,14 +6,16 @@ order from 0; times are seconds since the first presented frame. Edit lists and 
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 import os
 import queue
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
@@ -34,6 +36,9 @@ READ_AHEAD = 6
 # A decoder's threads wait for each other and for whoever takes the frames: several for each core keep it busy.
 THREADS_PER_CORE = 3
 MOST_THREADS = 16
+# What is larger is a picture; glibc's number for the size from which memory is the system's and not an arena's.
+PICTURE_BYTES = 1 << 20
+_M_MMAP_THRESHOLD = -3
 EIGHT_BIT_LUMA = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 
 
@@ -191,6 +196,7 @@ class FramesAhead:
     def __init__(
         self, path: File, start: int = 0, stop: int | None = None, *, threads: int = 0, index: FrameIndex | None = None
     ) -> None:
+        _give_pictures_back()
         self.start = start
         self._ahead: queue.Queue[Frame | Exception | None] = queue.Queue(maxsize=READ_AHEAD)
         self._seen: list[Frame] = []
@@ -249,6 +255,13 @@ class FramesAhead:
                 continue
             return True
         return False
+
+
+@cache
+def _give_pictures_back() -> None:
+    """Have the memory of pictures go back to the system when they do; glibc would keep it for threads that are gone."""
+    if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
+        mallopt(_M_MMAP_THRESHOLD, PICTURE_BYTES)
 
 
 def read_frames(
