@@ -147,10 +147,11 @@ def _check(options: argparse.Namespace) -> int:
 
 def _new(options: argparse.Namespace) -> int:
     from core.create import create_project
+    from core.storage import file_at
 
     project = create_project(
         options.folder,
-        video=options.video,
+        video=file_at(Path(), options.video),
         cloud=options.cloud,
         lens=options.lens,
         gps=options.gps,
@@ -281,7 +282,9 @@ def _add_new(commands: argparse._SubParsersAction[_Parser]) -> None:
         description="Make a project folder around input files. They stay where they are; nothing is overwritten.",
     )
     parser.add_argument("folder", type=Path, metavar="DIR", help="the folder to make")
-    parser.add_argument("--video", type=Path, required=True, metavar="FILE", help="the drone video")
+    parser.add_argument(
+        "--video", required=True, metavar="FILE", help="the drone video, or its address such as s3://campaign/eq7.mp4"
+    )
     parser.add_argument(
         "--cloud", type=Path, metavar="FILE", help="LiDAR points: LAS, LAZ, PLY, PCD, XYZ, PTS, CSV, E57"
     )

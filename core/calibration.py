@@ -334,6 +334,12 @@ def stationary(time_s: Floats, project: Project) -> Bools:
     return within(time_s, interval) if interval is not None else np.zeros(len(time_s), dtype=bool)
 
 
+def at_rest_again(time_s: Floats, project: Project) -> Bools:
+    """Return which frames the project says the building stands still in after the event."""
+    interval = project.intervals_s.residual
+    return within(time_s, interval) if interval is not None else np.zeros(len(time_s), dtype=bool)
+
+
 def _mean_seen(values: Floats) -> Floats:
     """Return the mean along the first axis of what is finite; nan where nothing is."""
     count = np.isfinite(values).sum(axis=0)

@@ -8,13 +8,14 @@ from pathlib import Path
 from core.errors import InputError
 from core.lens import read_lens, require_image_size
 from core.project import PROJECT_FILE, GpsInput, Inputs, Project, write_project
+from core.storage import FarFile, File
 from core.video import probe
 
 
 def create_project(
     folder: Path,
     *,
-    video: Path,
+    video: File,
     cloud: Path | None = None,
     lens: Path | None = None,
     gps: Path | None = None,
@@ -23,6 +24,7 @@ def create_project(
     """Make a project folder around inputs, which are named relative to it and not copied.
 
     Args:
+        video: on this machine, or far away; what lies far away is named by its address.
         name: what people call it; the folder's name where None.
 
     Raises:
@@ -34,7 +36,7 @@ def create_project(
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; choose a folder.")
     for path in (video, cloud, lens, gps):
-        if path is not None and not path.is_file():
+        if isinstance(path, Path) and not path.is_file():
             raise InputError(f"{path}: there is no such file; correct the path.")
     _require_lens_of_video(lens, video)
     project = Project(
@@ -50,14 +52,16 @@ def create_project(
     return project
 
 
-def _require_lens_of_video(lens: Path | None, video: Path) -> None:
+def _require_lens_of_video(lens: Path | None, video: File) -> None:
     info = probe(video)
     if lens is not None:
         require_image_size(read_lens(lens), width=info.width, height=info.height, lens_file=lens, video_file=video)
 
 
-def _seen_from(folder: Path, path: Path) -> str:
+def _seen_from(folder: Path, path: File) -> str:
     """Return the path relative to the folder with forward slashes; absolute where they share no drive."""
+    if isinstance(path, FarFile):
+        return path.address
     try:
         return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
     except ValueError:

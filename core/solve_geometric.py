@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from core.bodies import RestBody, midpoints, rest_body, world_points
-from core.calibration import Calibration, Evidence, calibrate, calibration_sigma, stationary
+from core.calibration import Calibration, Evidence, at_rest_again, calibrate, calibration_sigma, stationary
 from core.camera import Pose, fit_poses, plan_homographies
 from core.coordinates import Bools, Floats
 from core.errors import InputError
@@ -177,6 +177,7 @@ def _solve_target(
         places_m=places,
         rotation_rad=rotation,
         still=still & measured,
+        moving=~(still | at_rest_again(recording.time_s, project)),
     )
     history = TargetHistory(
         name=target.name,

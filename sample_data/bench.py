@@ -305,7 +305,9 @@ def peak_memory_mb() -> float:
 
 def in_own_process(part: str, folder: Path, count: int = 0) -> dict[str, Any]:
     """Return what a part measures, with the peak memory of its process and how busy others kept the machine."""
-    command = [sys.executable, "-m", "sample_data.bench", "--part", part, str(folder), "--frames", str(count)]
+    # Not as the main module: whatever that imports, each helping process would load again.
+    program = "import sys; from sample_data.bench import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", program, "--part", part, str(folder), "--frames", str(count)]
     started, others = time.perf_counter(), _busy_s() - _own_s()
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     others_s = _busy_s() - _own_s() - others

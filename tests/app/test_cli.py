@@ -231,6 +231,13 @@ def test_new_refers_to_inputs_from_its_folder(inputs: Path, tmp_path: Path, caps
     assert "eq7" in capsys.readouterr().out
 
 
+def test_new_names_a_video_that_lies_far_away_by_its_address(inputs: Path, tmp_path: Path) -> None:
+    address = (inputs / "video.mp4").resolve().as_uri()
+    assert main(["new", str(tmp_path / "eq7"), "--video", address, "--lens", str(inputs / "lens.yaml")]) == 0
+    assert read_project(tmp_path / "eq7").inputs.video == address
+    assert read_project(tmp_path / "eq7").inputs.lens is not None
+
+
 def test_new_leaves_an_existing_project_as_it_is(
     inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -246,6 +253,8 @@ def test_new_leaves_an_existing_project_as_it_is(
     [
         (["--video", "gone.mp4"], "gone.mp4: there is no such file"),
         (["--video", "gps.csv"], "gps.csv: cannot be opened as a video"),
+        (["--video", "memory://campaign/gone.mp4"], "memory://campaign/gone.mp4: not found"),
+        (["--video", "s3://me:secret@campaign/eq7.mp4"], "an address holds a password"),
         (["--video", "video.mp4", "--cloud", "gone.laz"], "gone.laz: there is no such file"),
         (["--video", "video.mp4", "--lens", "gps.csv"], "gps.csv: is not an OpenCV FileStorage file"),
     ],
