@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pickle
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Protocol
@@ -186,19 +186,30 @@ def measure(
             source = measure_on_cluster(
                 measure_remotely, eyes, lambda parts: missing_chunks(done, index, parts), len(index), scheduler
             )
-        finished = len(done)
-        progress("measuring", finished, len(index))
-        try:
-            with closing(source):
-                for measured in source:
-                    store.append(recording, measured)
-                    finished += 1
-                    progress("measuring", finished, len(index))
-                    cancel.raise_if_cancelled()
-        finally:
-            store.commit()
+        _take_over(source, store, recording, len(done), len(index), progress, cancel)
     store.finish(recording)
     return recording
+
+
+def _take_over(
+    source: Generator[FrameMeasurement, None, None],
+    store: MeasurementStore,
+    recording: int,
+    done: int,
+    total: int,
+    progress: Progress,
+    cancel: CancelToken,
+) -> None:
+    """Store what comes, as it comes; `done` of `total` frames are there already."""
+    progress("measuring", done, total)
+    try:
+        with closing(source):
+            for number, measured in enumerate(source, done + 1):
+                store.append(recording, measured)
+                progress("measuring", number, total)
+                cancel.raise_if_cancelled()
+    finally:
+        store.commit()
 
 
 def _before(store: MeasurementStore, recording: int | None, start: int) -> list[FrameMeasurement]:
