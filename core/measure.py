@@ -173,7 +173,7 @@ def measure(
         measurer = make_measurer(setup, reference, index, _reference_among(begun, setup))
         if recording is None:
             recording = store.begin(setup.method, setup.fingerprint, measurer.reference)
-        eyes = pickle.dumps(Eyes(setup, index, measurer.reference, measurer if helping else None))
+        eyes = pickle.dumps(Eyes(setup, index, measurer))
 
         def own(order: Order) -> Iterator[FrameMeasurement]:
             with begun.pop() if begun else _frames_of(setup, order.chunk, order.before, threads, index) as frames:
@@ -223,17 +223,11 @@ def _before(store: MeasurementStore, recording: int | None, start: int) -> list[
 
 @dataclass(frozen=True)
 class Eyes:
-    """What all chunks of a video have in common, sent to whoever measures them.
-
-    Attributes:
-        measurer: ready to measure, for those who sit near; None where its megabyte has too far to go, and the reference
-            frame is read again instead.
-    """
+    """What all chunks of a video have in common, sent to whoever measures them: nobody else reads the reference frame."""
 
     setup: MeasureSetup
     index: FrameIndex
-    reference: Reference
-    measurer: Measurer | None = None
+    measurer: Measurer
 
 
 class _Kept(threading.local):
@@ -241,7 +235,6 @@ class _Kept(threading.local):
 
     packed = b""
     eyes: Eyes
-    measurer: Measurer
 
 
 _kept = _Kept()
@@ -253,13 +246,11 @@ def measure_order(order: Order) -> Iterator[FrameMeasurement]:
     cv2.setNumThreads(1)
     if _kept.packed != order.eyes:
         _kept.eyes = pickle.loads(order.eyes)
-        eyes = _kept.eyes
-        _kept.measurer = eyes.measurer or make_measurer(eyes.setup, eyes.reference, eyes.index)
         _kept.packed = order.eyes
     yield from measure_chunk(
         _kept.eyes.setup,
         order.chunk,
-        measurer=_kept.measurer,
+        measurer=_kept.eyes.measurer,
         before=order.before,
         threads=1,
         index=_kept.eyes.index,
