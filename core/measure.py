@@ -223,7 +223,7 @@ def _before(store: MeasurementStore, recording: int | None, start: int) -> list[
 
 @dataclass(frozen=True)
 class Eyes:
-    """What all chunks of a video have in common, sent to whoever measures them: nobody else reads the reference frame."""
+    """What all chunks of a video have in common, sent to whoever measures them; they need no reference frame then."""
 
     setup: MeasureSetup
     index: FrameIndex
