@@ -157,23 +157,22 @@ def measure(
     recording = store.find(setup.method, setup.fingerprint)
     if recording is not None and store.is_finished(recording):
         return recording
-    index = frame_index(setup.video)
-    done = [] if recording is None else store.measured_frames(recording)
-    chunks = missing_chunks(done, index, workers, HEAD_START) if scheduler is None else []
-    helping = max(0, min(workers, len(chunks)) - 1)
-    before = [_before(store, recording, chunk.start) for chunk in chunks]
-    threads = 1 if helping else 0
-    with Helpers(measure_order, helping) as helpers, ExitStack() as stack:
-        # Decoding begins while the reference frame is still being looked at.
-        begun = [
-            stack.enter_context(_frames_of(setup, chunk, known, threads, index))
-            for chunk, known in zip(chunks[:1], before, strict=False)
-        ]
+    with ExitStack() as stack:
+        # A whole clip is being decoded while its timestamps and its reference frame are still looked at.
+        is_whole = recording is None and workers == 1 and scheduler is None
+        begun = [stack.enter_context(FramesAhead(setup.video))] if is_whole else []
+        index = frame_index(setup.video)
+        done = [] if recording is None else store.measured_frames(recording)
+        chunks = missing_chunks(done, index, workers, HEAD_START) if scheduler is None else []
+        before = [_before(store, recording, chunk.start) for chunk in chunks]
+        helping = max(0, min(workers, len(chunks)) - 1)
+        helpers = stack.enter_context(Helpers(measure_order, helping))
         reference = None if recording is None else store.reference(recording)
         measurer = make_measurer(setup, reference, index, _reference_among(begun, setup))
         if recording is None:
             recording = store.begin(setup.method, setup.fingerprint, measurer.reference)
         eyes = pickle.dumps(Eyes(setup, index, measurer))
+        threads = 1 if helping else 0
 
         def own(order: Order) -> Iterator[FrameMeasurement]:
             with begun.pop() if begun else _frames_of(setup, order.chunk, order.before, threads, index) as frames:
