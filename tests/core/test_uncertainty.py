@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from core.coordinates import Floats
+from core.uncertainty import LEAST_STILL, MOVING, Sigma, combined_sigma, common_error
+
+FRAMES = 400
+STILL = np.arange(FRAMES) < 150
+MOVING_FRAMES = (np.arange(FRAMES) >= 150) & (np.arange(FRAMES) < 300)
+
+
+def combined(places_m: Floats, *, slow_m: float = 0.0, still: Floats = STILL) -> Sigma:
+    points = Sigma(np.full((FRAMES, 2, 2), 1e-4), np.full(FRAMES, 2e-5))
+    return combined_sigma(
+        points,
+        camera_m=np.full((FRAMES, 2), 5e-5),
+        shared_m=np.full(FRAMES, 5e-5),
+        slow_m=np.full((FRAMES, 2, 2), slow_m),
+        places_m=places_m,
+        rotation_rad=1e-5 * places_m[:, 0, 0] / places_m[:, 0, 0].std(),
+        still=np.asarray(still, dtype=bool),
+        moving=MOVING_FRAMES,
+    )
+
+
+@pytest.fixture
+def places_m() -> Floats:
+    return np.random.default_rng(3).normal(scale=4e-4, size=(FRAMES, 2, 2))
+
+
+def test_error_bars_are_held_against_the_scatter_at_rest(places_m: Floats) -> None:
+    sigma = combined(places_m)
+    np.testing.assert_allclose(sigma.places_m[STILL].mean(axis=0), places_m[STILL].std(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(sigma.rotation_rad[STILL].mean(), 1e-5, rtol=0.2)
+
+
+def test_error_bars_widen_where_the_roof_moves_and_not_after(places_m: Floats) -> None:
+    sigma = combined(places_m)
+    at_rest, moving, after = (sigma.places_m[part].mean(axis=0) for part in (STILL, MOVING_FRAMES, slice(300, None)))
+    np.testing.assert_allclose(moving, MOVING * at_rest)
+    np.testing.assert_allclose(after, at_rest)
+    np.testing.assert_allclose(sigma.rotation_rad[200], MOVING * sigma.rotation_rad[0])
+
+
+def test_what_the_calibration_leaves_open_is_never_scaled_down(places_m: Floats) -> None:
+    sigma = combined(0.1 * places_m, slow_m=1e-3)
+    assert (sigma.places_m >= 1e-3).all()
+
+
+def test_few_frames_at_rest_say_nothing(places_m: Floats) -> None:
+    sigma = combined(places_m, still=np.arange(FRAMES) < LEAST_STILL - 1)
+    np.testing.assert_allclose(sigma.places_m[0], np.sqrt(1e-8 + 2 * 25e-10))
+
+
+def test_a_target_whose_pieces_wander_errs_as_a_whole() -> None:
+    rng = np.random.default_rng(4)
+    time_s = np.arange(FRAMES) / 30
+    own = rng.normal(scale=1.0, size=(FRAMES, 3, 64))
+    wandering = np.repeat(rng.normal(scale=1.0, size=(FRAMES, 3, 8)), 8, axis=2)
+    wandering[~MOVING_FRAMES] *= 0.3
+    error = common_error(own + wandering, time_s, STILL)
+    assert np.median(error[170:280]) > 1.8 * np.median(error[:130])
