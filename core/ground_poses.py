@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from core.camera import Pose, PoseFit, fit_poses, intersect_height, plan_homographies
 from core.coordinates import Bools, Floats, finite_median
@@ -22,7 +23,8 @@ TRUST_FRAMES = 1000
 # Least scatter of ground points at which outliers are told, pixels.
 LEAST_SIGMA_PX = 0.01
 # A starved encoder repeats the ground of a key frame in the frames that follow, while strips go on moving. Where
-# features usually scatter by more than the first, pixels, a scatter below this part of it is no view of its own.
+# features usually scatter by more than the first, pixels, a frame shows a repetition and no view of its own if their
+# scatter, and how much it differs from the frame before, are both below this part of what is usual.
 COARSE_PX = 0.15
 REPEATED = 0.45
 
@@ -80,14 +82,26 @@ def solve_ground(
     count = inlier.sum(axis=1)
     rms = np.sqrt(squared.sum(axis=1) / np.maximum(2 * count, 1)) * focal
     usable = (count >= LEAST_GROUND) & np.isfinite(poses.centre_m).all(axis=1) & (poses.centre_m[:, 2] > 0)
-    usable &= ~_repeated(rms, usable) | (recording.frame == reference_frame)
+    usable &= ~_repeated(recording.ground_raw, rms, usable) | (recording.frame == reference_frame)
     return Ground(points, agreeing, plan_homographies(poses.R, poses.centre_m), poses, rms, count, usable)
 
 
-def _repeated(rms_px: Floats, usable: Bools) -> Bools:
+def _repeated(ground_raw: Floats, rms_px: Floats, usable: Bools) -> Bools:
     """Return which frames (F,) show the ground of the reference frame again instead of their own."""
+    repeated = np.zeros(len(rms_px), dtype=bool)
     usual = float(np.median(rms_px[usable])) if usable.any() else 0.0
-    return np.asarray((usual > COARSE_PX) & (rms_px < REPEATED * usual))
+    near = np.flatnonzero((rms_px < REPEATED * usual) & (np.arange(len(rms_px)) > 0))
+    if usual > COARSE_PX and len(near):
+        some = np.unique(np.linspace(1, len(rms_px) - 1, TRUST_FRAMES).astype(np.int64))
+        usual_change = float(np.median(_change_px(ground_raw, some)))
+        repeated[near] = _change_px(ground_raw, near) < REPEATED * usual_change
+    return repeated
+
+
+def _change_px(ground_raw: Floats, frames: NDArray[np.int64]) -> Floats:
+    """Return how unevenly features (F, N, 2) have moved since the frame before, in some frames (M,)."""
+    moved = np.moveaxis(ground_raw[frames] - ground_raw[frames - 1], -1, 1)
+    return 1.4826 * finite_median(np.abs(moved - finite_median(moved)[..., None]).reshape(len(frames), -1))
 
 
 def _trust(poses: PoseFit) -> Floats:

@@ -128,6 +128,15 @@ def test_frames_that_repeat_the_ground_of_the_reference_frame_are_lost() -> None
     assert (np.delete(history.status, np.arange(1, 6)) != Status.LOST).all()
 
 
+def test_a_coarse_fit_elsewhere_makes_no_repetition_of_good_frames() -> None:
+    # With a wrong lens and much drift, features fit the better the nearer the view is to the reference frame's.
+    recording = scene.recording(0.05)
+    wander = np.linspace(0.0, 1.0, len(recording.frame))[:, None, None]
+    bent = 0.9 * np.random.default_rng(7).normal(size=(1, *recording.ground_raw.shape[1:]))
+    history = solved(replace(recording, ground_raw=recording.ground_raw + wander * bent)).histories["roof"]
+    assert (history.status == Status.OK).all()
+
+
 def test_a_clean_view_like_the_reference_frame_is_no_repetition() -> None:
     recording = scene.recording(0.05)
     ground = recording.ground_raw.copy()
