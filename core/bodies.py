@@ -7,10 +7,13 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from core.camera import Pose, PoseFit, intersect_height
-from core.coordinates import Bools, Floats
+from core.coordinates import Bools, Floats, batches
 from core.lens import Lens
 from core.measurements import Recording
 from core.motion import LineSet, RigidFit, fit_line, rigid_from_lines, rigid_from_points, rigid_with_weights
+
+# Frames fitted at a time; what scatter is usual is told from them.
+BATCH = 1024
 
 
 def world_points(raw: Floats, lens: Lens, poses: PoseFit | Pose, z_m: float) -> Floats:
@@ -18,10 +21,6 @@ def world_points(raw: Floats, lens: Lens, poses: PoseFit | Pose, z_m: float) -> 
     rays = lens.rays_from_raw(raw)
     flat = rays.reshape(len(rays), -1, 2)
     return intersect_height(poses.R, poses.centre_m, flat, z_m).reshape(rays.shape)
-
-
-# Frames fitted at a time; what scatter is usual is told from them.
-BATCH = 1024
 
 
 @dataclass(frozen=True)
@@ -56,8 +55,8 @@ class RestBody:
     def _fit(self, points: Floats, pattern: Floats | None) -> RigidFit:
         """Fit some frames at a time, since a fit takes many times the memory of its points."""
         fits = []
-        for first in range(0, max(len(points), 1), BATCH):
-            some = points[first : first + BATCH]
+        for batch in batches(len(points), BATCH):
+            some = points[batch]
             weight = np.ones(some.shape[:-1])
             if self.lines is not None:
                 fits.append(rigid_from_lines(some, weight, self.lines, pattern=pattern))

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from core.bodies import midpoints, rest_body, world_points
 from core.camera import Pose, PoseFit, fit_poses
-from core.coordinates import Bools, Floats, finite_median, finite_rows
+from core.coordinates import Bools, Floats, evenly_spread, finite_median, finite_rows
 from core.georeference import ReferenceFit, reference_centre_sigma, reference_pose
 from core.ground_poses import click_elevation, ground_points, solve_ground
-from core.intervals import within
+from core.intervals import during, within
 from core.lens import Lens
 from core.measurements import Recording
 from core.motion import is_determined
@@ -31,7 +31,6 @@ from core.solution import Ground
 # Moments at which corrections are tried, and the fewest that say anything.
 MOMENTS = 48
 LEAST_MOMENTS = 12
-FEATURES = 230
 # Drift below which stationary frames say nothing about the calibration, metres.
 LEAST_DRIFT_M = 0.02
 # Uncertainty of a roof's height above the ground, one standard deviation: LiDAR, and where exactly the strip lies.
@@ -66,8 +65,8 @@ class Evidence:
     """A recording with what a calibration is tried against.
 
     Attributes:
-        recording: at the frames' time stamps, with `FEATURES` ground features at most.
-        speed: (F, N, 2) of these features in the image, raw pixels a second.
+        recording: at the frames' time stamps.
+        speed: (F, N, 2) of its ground features in the image, raw pixels a second.
         ground: poses under the calibration as it came.
     """
 
@@ -90,13 +89,9 @@ class Evidence:
         relief: Relief | None,
     ) -> Evidence:
         """Return the evidence a recording holds; `speed` as `core.row_times.ground_speed`."""
-        # Calibration shows in slow motion, which needs no more features.
-        kept = slice(None, None, max(1, recording.ground_raw.shape[1] // FEATURES))
-        thinned = replace(recording.reference, ground_raw=recording.reference.ground_raw[kept])
-        some = replace(recording, reference=thinned, ground_raw=recording.ground_raw[:, kept])
         frame0 = project.reference_frame
-        ground = solve_ground(some, start.lens, start.pose0, reference.origin_m, relief, reference_frame=frame0)
-        return cls(some, speed[:, kept], project, start, reference, relief, ground)
+        ground = solve_ground(recording, start.lens, start.pose0, reference.origin_m, relief, reference_frame=frame0)
+        return cls(recording, speed, project, start, reference, relief, ground)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -309,7 +304,7 @@ def calibration_sigma(evidence: Evidence, calibration: SelfCalibration) -> dict[
     usable = np.flatnonzero(evidence.ground.usable)
     if not len(usable):
         return unknown
-    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, MOMENTS).astype(int))]
+    chosen = usable[evenly_spread(len(usable), MOMENTS)]
     trials = _Trials(evidence, [np.array([frame]) for frame in chosen])
     motion = trials.motion(calibration.correction)
     steps = 0.5 * np.array([parameter.sigma for parameter in calibration.parameters])
@@ -319,25 +314,13 @@ def calibration_sigma(evidence: Evidence, calibration: SelfCalibration) -> dict[
     known = np.isfinite(J).all(axis=(1, 2, 3, 4))
     if not known.any():
         return unknown
-    still = known & stationary(recording.time_s, evidence.project)[chosen]
+    still = known & during(recording.time_s, evidence.project.intervals_s.pre_event)[chosen]
     rest = J[still].mean(axis=0) if still.any() else J[known][0]
     sigma = np.sqrt(np.maximum(np.einsum("...u,uv,...v->...", J - rest, calibration.covariance, J - rest), 0.0))
     moments = recording.time_s[chosen][known]
     columns = [np.interp(recording.time_s, moments, column) for column in sigma[known].reshape(len(moments), -1).T]
     every = np.stack(columns, axis=1).reshape(frames, len(targets), 2, 2)
     return {target.name: every[:, number] for number, target in enumerate(targets)}
-
-
-def stationary(time_s: Floats, project: Project) -> Bools:
-    """Return which frames the project says the building stood still in before the event."""
-    interval = project.intervals_s.pre_event
-    return within(time_s, interval) if interval is not None else np.zeros(len(time_s), dtype=bool)
-
-
-def at_rest_again(time_s: Floats, project: Project) -> Bools:
-    """Return which frames the project says the building stands still in after the event."""
-    interval = project.intervals_s.residual
-    return within(time_s, interval) if interval is not None else np.zeros(len(time_s), dtype=bool)
 
 
 def _mean_seen(values: Floats) -> Floats:

@@ -7,13 +7,12 @@ raw pixels to rays and back.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.coordinates import Floats, finite_median, finite_rows
+from core.coordinates import Floats, batches, finite_median, finite_rows
 
 # Frames solved together: bounds the memory of the normal equations to some tens of MB at 500 points a frame.
 BATCH = 96
@@ -176,13 +175,9 @@ def fit_poses(
             rays[s], weight[s], points_m, R0[s], C0[s],
             iterations=iterations, robust=robust, sigma_floor=sigma_floor, unknowns=unknowns,
         )
-        for s in _batches(frames)
+        for s in batches(frames, BATCH)
     ]  # fmt: skip
     return PoseFit(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-
-def _batches(frames: int) -> Iterator[slice]:
-    return (slice(first, first + BATCH) for first in range(0, max(frames, 1), BATCH))
 
 
 def _fit_batch(

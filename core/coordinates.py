@@ -15,6 +15,7 @@ one JavaScript module.)
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,6 +67,16 @@ def finite_median(values: Floats) -> Floats:
     low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=-1)
     high = np.take_along_axis(ordered, np.minimum(count // 2, ordered.shape[-1] - 1), axis=-1)
     return np.asarray(np.where(count > 0, 0.5 * (low + high), 0.0)[..., 0])
+
+
+def batches(count: int, size: int) -> Iterator[slice]:
+    """Yield slices of at most `size` that cover `count` places; one empty slice where there are none."""
+    return (slice(first, first + size) for first in range(0, max(count, 1), size))
+
+
+def evenly_spread(count: int, most: int) -> NDArray[np.int64]:
+    """Return at most `most` of the numbers below `count`, ascending and evenly spread, both ends included."""
+    return np.unique(np.linspace(0, count - 1, most).astype(np.int64))
 
 
 def rotation_2d(angle_rad: float) -> Floats:

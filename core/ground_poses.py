@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.camera import Pose, PoseFit, fit_poses, intersect_height, plan_homographies
-from core.coordinates import Bools, Floats, finite_median
+from core.coordinates import Bools, Floats, evenly_spread, finite_median
 from core.georeference import ReferenceFit, fit_reference
 from core.lens import Lens
 from core.measurements import Recording
@@ -92,7 +92,7 @@ def _repeated(ground_raw: Floats, rms_px: Floats, usable: Bools) -> Bools:
     usual = float(np.median(rms_px[usable])) if usable.any() else 0.0
     near = np.flatnonzero((rms_px < REPEATED * usual) & (np.arange(len(rms_px)) > 0))
     if usual > COARSE_PX and len(near):
-        some = np.unique(np.linspace(1, len(rms_px) - 1, TRUST_FRAMES).astype(np.int64))
+        some = 1 + evenly_spread(len(rms_px) - 1, TRUST_FRAMES)
         usual_change = float(np.median(_change_px(ground_raw, some)))
         repeated[near] = _change_px(ground_raw, near) < REPEATED * usual_change
     return repeated

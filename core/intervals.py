@@ -22,3 +22,8 @@ def within(time_s: ArrayLike, interval_s: tuple[float, float] | None) -> Bools:
     if interval_s is None:
         return np.ones(times.shape, dtype=np.bool_)
     return np.asarray((times >= interval_s[0]) & (times <= interval_s[1]), dtype=np.bool_)
+
+
+def during(time_s: ArrayLike, interval_s: tuple[float, float] | None) -> Bools:
+    """Return which times lie in an interval, as `within`, but no interval holds none."""
+    return within(time_s, interval_s) & (interval_s is not None)

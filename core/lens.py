@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.coordinates import Floats, read_only
+from core.coordinates import Floats, batches, read_only
 from core.errors import InputError
 from core.project import write_atomically
 from core.storage import File
@@ -140,8 +140,8 @@ class Lens:
             return distorted
         flat = distorted.reshape(-1, 2)
         rays = np.empty_like(flat)
-        for first in range(0, len(flat), _BLOCK):
-            rays[first : first + _BLOCK] = self._undistorted(flat[first : first + _BLOCK])
+        for some in batches(len(flat), _BLOCK):
+            rays[some] = self._undistorted(flat[some])
         return rays.reshape(raw.shape)
 
     def _undistorted(self, distorted: Floats) -> Floats:

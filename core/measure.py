@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pickle
 import threading
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Protocol
@@ -23,7 +23,7 @@ from core.ground import FEATURES, GroundTracker, choose_features, ground_mask
 from core.measurements import FrameMeasurement, MeasurementStore, Reference
 from core.prediction import MeasureSetup, nothing_measured, predict_apparent, predict_homography
 from core.progress import CancelToken, Progress, silent
-from core.video import Frame, FrameIndex, FramesAhead, Luma, frame_index, read_frame
+from core.video import FrameIndex, FramesAhead, Luma, frame_index, read_frame
 from core.workers import Helpers, Order
 
 
@@ -93,6 +93,7 @@ def measure_chunk(
     before: Sequence[FrameMeasurement] = (),
     threads: int = 0,
     index: FrameIndex | None = None,
+    begun: FramesAhead | None = None,
 ) -> Iterator[FrameMeasurement]:
     """Yield the measurements of a chunk's frames in order.
 
@@ -100,34 +101,22 @@ def measure_chunk(
         before: the last two frames before the chunk, where known; otherwise the chunk finds its own way in.
         threads: decoder threads, as `FramesAhead`.
         index: of the video, where it is known already.
+        begun: the chunk's frames, where decoding them has begun already.
     """
-    with _frames_of(setup, chunk, before, threads, index) as frames:
-        yield from _measured(frames, chunk, measurer, before)
-
-
-def _frames_of(
-    setup: MeasureSetup, chunk: Chunk, before: Sequence[FrameMeasurement], threads: int, index: FrameIndex | None
-) -> FramesAhead:
-    """Return a chunk's frames and, where nothing is known of those before it, some to warm up on."""
     first = chunk.start if before else max(0, chunk.start - WARM_UP)
-    return FramesAhead(setup.video, first, chunk.stop, threads=threads, index=index)
-
-
-def _reference_among(begun: Sequence[FramesAhead], setup: MeasureSetup) -> Luma | None:
-    """Return the reference frame if decoding has begun with it, so that it need not be decoded twice."""
-    first = next((frames.first() for frames in begun if frames.start == setup.reference_frame), None)
-    return None if first is None else first.luma
-
-
-def _measured(
-    frames: Iterable[Frame], chunk: Chunk, measurer: Measurer, before: Sequence[FrameMeasurement]
-) -> Iterator[FrameMeasurement]:
     history = list(before)[-2:]
-    for frame in frames:
-        measured = measurer.measure(frame.luma, frame=frame.index, time_s=frame.time_s, before=history)
-        history = [*history[-1:], measured]
-        if frame.index >= chunk.start:
-            yield measured
+    with begun or FramesAhead(setup.video, first, chunk.stop, threads=threads, index=index) as frames:
+        for frame in frames:
+            measured = measurer.measure(frame.luma, frame=frame.index, time_s=frame.time_s, before=history)
+            history = [*history[-1:], measured]
+            if frame.index >= chunk.start:
+                yield measured
+
+
+def _reference_in(begun: FramesAhead | None, setup: MeasureSetup) -> Luma | None:
+    """Return the reference frame if decoding has begun with it, so that it need not be decoded twice."""
+    first = begun.first() if begun is not None and begun.start == setup.reference_frame else None
+    return None if first is None else first.luma
 
 
 def measure(
@@ -160,7 +149,7 @@ def measure(
     with ExitStack() as stack:
         # A whole clip is being decoded while its timestamps and its reference frame are still looked at.
         is_whole = recording is None and workers == 1 and scheduler is None
-        begun = [stack.enter_context(FramesAhead(setup.video))] if is_whole else []
+        begun = stack.enter_context(FramesAhead(setup.video)) if is_whole else None
         index = frame_index(setup.video)
         done = [] if recording is None else store.measured_frames(recording)
         chunks = missing_chunks(done, index, workers, HEAD_START) if scheduler is None else []
@@ -168,15 +157,22 @@ def measure(
         helping = max(0, min(workers, len(chunks)) - 1)
         helpers = stack.enter_context(Helpers(measure_order, helping))
         reference = None if recording is None else store.reference(recording)
-        measurer = make_measurer(setup, reference, index, _reference_among(begun, setup))
+        measurer = make_measurer(setup, reference, index, _reference_in(begun, setup))
         if recording is None:
             recording = store.begin(setup.method, setup.fingerprint, measurer.reference)
         eyes = pickle.dumps(Eyes(setup, index, measurer))
         threads = 1 if helping else 0
 
         def own(order: Order) -> Iterator[FrameMeasurement]:
-            with begun.pop() if begun else _frames_of(setup, order.chunk, order.before, threads, index) as frames:
-                yield from _measured(frames, order.chunk, measurer, order.before)
+            return measure_chunk(
+                setup,
+                order.chunk,
+                measurer=measurer,
+                before=order.before,
+                threads=threads,
+                index=index,
+                begun=begun,
+            )
 
         if scheduler is None:
             orders = [Order(eyes, chunk, known) for chunk, known in zip(chunks, before, strict=True)]

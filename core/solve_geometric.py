@@ -11,13 +11,14 @@ from dataclasses import replace
 import numpy as np
 
 from core.bodies import RestBody, midpoints, rest_body, world_points
-from core.calibration import Calibration, Evidence, at_rest_again, calibrate, calibration_sigma, stationary
+from core.calibration import Calibration, Evidence, calibrate, calibration_sigma
 from core.camera import Pose, fit_poses, plan_homographies
-from core.coordinates import Bools, Floats
+from core.coordinates import Bools, Floats, evenly_spread
 from core.errors import InputError
 from core.flight import SmoothFlight, smooth_flight
 from core.georeference import ReferenceFit
 from core.ground_poses import fit_with_relief, solve_ground
+from core.intervals import during
 from core.lens import Lens
 from core.measurements import Recording
 from core.motion import RigidFit, is_determined_as_usual
@@ -99,7 +100,7 @@ def _readout(
     """Return the rolling shutter as the lens file says it, or as the ground shows it wherever the view turns."""
     if start.lens.readout_s:
         return Readout(start.lens.readout_s, None, "lens file")
-    chosen = np.unique(np.linspace(0, len(recording.frame) - 1, READOUT_FRAMES).astype(np.int64))
+    chosen = evenly_spread(len(recording.frame), READOUT_FRAMES)
     some = recording.selected(chosen)
     ground = solve_ground(some, start.lens, start.pose0, reference.origin_m, relief)
     poses = ground.known_poses
@@ -153,7 +154,7 @@ def _solve_target(
     height = used.heights_m[target.name]
     body = rest_body(recording, target.name, used.lens, used.pose0, height)
     points = world_points(midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, height)
-    still = stationary(recording.time_s, project)
+    still = during(recording.time_s, project.intervals_s.pre_event)
     fit = body.fit(points, still & ground.usable)
     used_points = (fit.weight > 0.1).reshape(len(fit.weight), -1).sum(axis=1)
     status = frame_status(recording, project, ground, used_points, is_determined_as_usual(fit.normal))
@@ -177,7 +178,7 @@ def _solve_target(
         places_m=places,
         rotation_rad=rotation,
         still=still & measured,
-        moving=~(still | at_rest_again(recording.time_s, project)),
+        moving=~(still | during(recording.time_s, project.intervals_s.residual)),
     )
     history = TargetHistory(
         name=target.name,
