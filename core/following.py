@@ -21,7 +21,7 @@ from core.lens import Lens
 from core.motion import LineSet, RigidFit, fit_line, is_determined, rigid_from_points, rough_rigid_from_lines
 from core.patches import PatchTracker
 from core.project import LINE_NAMES, Target
-from core.roof_lines import NOT_FOUND, STATIONS, LineMatch, LineTracker
+from core.roof_lines import NOT_FOUND, STATIONS, LineMatch, LineTracker, find_strips
 from core.video import Luma
 
 # Correlation of the whole target's picture below which it is not recognised.
@@ -29,6 +29,8 @@ LEAST_LIKENESS = 0.35
 # How far a target is searched for around its place in the reference frame, plan metres: 0.8 m of motion, enlarged by
 # its height, and as much parallax.
 SEARCH_M = 2.4
+# How far around where strips were found their neighbours lie: what is taken for the target instead of it.
+NEIGHBOURS_M = 1.4
 # Roof motion between two frames changes by up to some 8 cm when it shakes hardest (3 Hz at 4 m/s, 30 Hz video).
 LINE_SEARCH_M = 0.14
 # Every so many frames the whole picture confirms that no neighbouring strip has been taken.
@@ -145,19 +147,20 @@ class LinesFollower:
     def find(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool) -> TargetMatch:
         """Return the lines in a frame; see `Follower.find`."""
         found = self._measure(luma, H_ray_ray0, predicted) if predicted is not None else None
-        if found is not None and found.apparent is not None and not confirm:
+        if found is not None and self._may_be_kept(luma, H_ray_ray0, found.apparent, confirm):
             return found
         seen = self._finder.search(luma, H_ray_ray0)
         if seen is None:
             return found or TargetMatch(np.full_like(self.reference_raw, np.nan), None)
-        if found is not None and found.apparent is not None and self._finder.agrees(seen, found.apparent):
-            return found
         rotation = predicted.rotation_rad if predicted is not None else 0.0
         return self._measure(luma, H_ray_ray0, Apparent(seen, rotation))
 
+    def _may_be_kept(self, luma: Luma, H_ray_ray0: Floats, apparent: Apparent | None, confirm: bool) -> bool:
+        return apparent is not None and (not confirm or self._finder.agrees(luma, H_ray_ray0, apparent))
+
     def _measure(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent) -> TargetMatch:
         to_raw = self._mapping(H_ray_ray0, predicted)
-        matches = [tracker.find(luma, to_raw, search_px=self._search_px) for tracker in self.trackers]
+        matches = find_strips(self.trackers, luma, to_raw, search_px=self._search_px)
         apparent = self._apparent(matches, H_ray_ray0, predicted)
         return TargetMatch(np.stack([match.edges_raw for match in matches]), apparent)
 
@@ -231,30 +234,37 @@ class TargetFinder:
         # About a strip's width per sample, so that strips still show and the search stays small.
         self._factor = max(1, round(0.035 * scale.pixels_per_m))
         self._step = self._factor / float(lens.focal_px.mean())
-        self._reach = int(np.ceil(SEARCH_M * scale.rays_per_m / self._step))
+        self._reach, self._near = (
+            int(np.ceil(far_m * scale.rays_per_m / self._step)) for far_m in (SEARCH_M, NEIGHBOURS_M)
+        )
         self._tolerance = 0.15 * scale.rays_per_m
         low, high = outline.min(axis=0), outline.max(axis=0)
         self._low = low
         self._size = np.maximum(np.ceil((high - low) / self._step).astype(np.int64) + 1, 8)
-        self._template = self._picture(luma, np.eye(3), 0)
+        self._template = self._picture(luma, np.eye(3), np.zeros(2), 0)
 
     def search(self, luma: Luma, H_ray_ray0: Floats) -> Floats | None:
         """Return the target's apparent shift (2,) in rays of the reference frame, or None if it is not recognised."""
-        wide = self._picture(luma, H_ray_ray0, self._reach)
+        return self._likest(luma, H_ray_ray0, np.zeros(2), self._reach)
+
+    def agrees(self, luma: Luma, H_ray_ray0: Floats, apparent: Apparent) -> bool:
+        """Whether the whole picture shows the target where it was tracked to, and not one of its neighbours there."""
+        shift = self._likest(luma, H_ray_ray0, apparent.shift, self._near)
+        return shift is not None and bool(np.linalg.norm(shift - apparent.shift) < self._tolerance)
+
+    def _likest(self, luma: Luma, H_ray_ray0: Floats, around: Floats, reach: int) -> Floats | None:
+        """Return the shift within `reach` samples around one at which the target's picture is found, or None."""
+        wide = self._picture(luma, H_ray_ray0, around, reach)
         likeness = cv2.matchTemplate(wide, self._template, cv2.TM_CCOEFF_NORMED)
         _, best, _, (u, v) = cv2.minMaxLoc(likeness)
         if best < LEAST_LIKENESS:
             return None
-        return (np.array([u, v], dtype=np.float64) - self._reach) * self._step
+        return around + (np.array([u, v], dtype=np.float64) - reach) * self._step
 
-    def agrees(self, shift: Floats, apparent: Apparent) -> bool:
-        """Whether a tracked motion is the one the whole picture shows."""
-        return bool(np.linalg.norm(shift - apparent.shift) < self._tolerance)
-
-    def _picture(self, luma: Luma, H_ray_ray0: Floats, reach: int) -> NDArray[np.uint8]:
-        """Return the reduced picture of the target's surroundings, in the reference frame's geometry."""
+    def _picture(self, luma: Luma, H_ray_ray0: Floats, shift: Floats, reach: int) -> NDArray[np.uint8]:
+        """Return the reduced picture of the shifted target's surroundings, in the reference frame's geometry."""
         size = self._size + 2 * reach
-        low = self._low - reach * self._step
+        low = self._low + shift - reach * self._step
         # The map is smooth: computed at some places and interpolated in between.
         knots = [np.linspace(0.0, float(n - 1), 17) for n in size]
         u, v = np.meshgrid(*knots)

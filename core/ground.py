@@ -46,6 +46,26 @@ class GroundMatch:
     inliers: int
 
 
+@dataclass(frozen=True)
+class ExpectedFeatures:
+    """Where N features should be in a frame.
+
+    Attributes:
+        rays, raw: (N, 2); raw is nan where the lens images nothing.
+        J_raw_rays: (N, 2, 2) how raw pixels change with rays.
+        ref_from_current: (N, 2, 2) deformation of patches, reference pixels by frame pixels.
+    """
+
+    rays: Floats
+    raw: Floats
+    J_raw_rays: Floats
+    ref_from_current: Floats
+
+    def rays_seen(self, raw: Floats) -> Floats:
+        """Return the rays (N, 2) of raw pixels that lie a pixel or two beside, good to a thousandth of a pixel."""
+        return np.asarray(self.rays + np.linalg.solve(self.J_raw_rays, (raw - self.raw)[..., None])[..., 0])
+
+
 def choose_features(luma: Luma, moving_regions_px: Sequence[Sequence[tuple[float, float]]], count: int) -> Floats:
     """Return about `count` corners (N, 2) of the reference frame, raw pixels, evenly spread outside the regions.
 
@@ -167,26 +187,27 @@ class GroundTracker:
         return self._refine(luma, coarse.H_ray_ray0) if coarse is not None else None
 
     def _refine(self, luma: Luma, H_ray_ray0: Floats) -> GroundMatch | None:
-        predicted, ref_from_current = self.predict(H_ray_ray0)
-        matches = self.patches.track(luma, predicted, ref_from_current)
+        expected = self.predict(H_ray_ray0)
+        matches = self.patches.track(luma, expected.raw, expected.ref_from_current)
         good = np.flatnonzero(matches.score >= LEAST_SCORE)
         if len(good) < LEAST_POINTS:
             return None
         focal = float(self._lens.focal_px.mean())
-        rays = self._lens.rays_from_raw(matches.raw[good])
+        rays = expected.rays_seen(matches.raw)[good]
         H, inlier = fit_homography(self._rays0[good], rays, tolerance=1.0 / focal)
         if H is None or inlier.sum() < LEAST_POINTS:
             return None
         return GroundMatch(matches=matches, H_ray_ray0=H, inliers=int(inlier.sum()))
 
-    def predict(self, H_ray_ray0: Floats) -> tuple[Floats, Floats]:
-        """Return where the features should be (N, 2) raw and their deformation (N, 2, 2), reference by frame."""
+    def predict(self, H_ray_ray0: Floats) -> ExpectedFeatures:
+        """Return where the features should be, and how they should look."""
         rays = apply_homography(H_ray_ray0, self._rays0)
-        J = self._lens.jacobian_raw_rays(rays) @ homography_jacobian(H_ray_ray0, self._rays0) @ self._J0_inverse
+        J_raw_rays = self._lens.jacobian_raw_rays(rays)
+        J = J_raw_rays @ homography_jacobian(H_ray_ray0, self._rays0) @ self._J0_inverse
         usable: Bools = np.asarray(np.isfinite(J).all(axis=(1, 2)))
-        J[~usable] = np.eye(2)
+        J[~usable] = J_raw_rays[~usable] = np.eye(2)
         raw = np.where(usable[:, None], self._lens.raw_from_rays(rays), np.nan)
-        return raw, np.linalg.inv(J)
+        return ExpectedFeatures(rays, raw, J_raw_rays, np.linalg.inv(J))
 
 
 def homography_jacobian(H: Floats, points: Floats) -> Floats:

@@ -9,8 +9,9 @@ The mid-line of two opposite edges does not move when blur or exposure change; a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,8 @@ LEAST_EDGE = 1.5
 # Correlation of the cross profile below which something else lies in the band.
 LEAST_CORRELATION = 0.5
 HALLEY_STEPS = 3
+# The two edges of a strip, on either side of its mid-line.
+SIDES = np.array([[-1.0], [1.0]])
 # Parts of a band whose cross profiles are compared one by one, so that one hidden part does not decide.
 QUARTERS = 4
 
@@ -51,6 +54,16 @@ class StripProfile:
     polarity: float
     edge: float
     signature: Singles
+
+    @property
+    def scale_px(self) -> float:
+        """Width of the Gaussian whose derivative finds an edge: near a sharp picture's blur, under half the strip."""
+        return float(np.clip(self.width_px / 5.0, 0.8, 1.5))
+
+    @property
+    def capture_px(self) -> float:
+        """How far an edge may lie from where the mid-line says."""
+        return min(3.0, 0.6 * self.width_px)
 
 
 @dataclass(frozen=True)
@@ -122,12 +135,12 @@ class LineTracker:
     """
 
     def __init__(self, luma: Luma, ends: Floats, to_raw: Mapping, *, width_px: float, name: str) -> None:
-        self._axis_points = ends[0] + np.linspace(0.0, 1.0, 33)[:, None] * (ends[1] - ends[0])
+        self.axis_points = ends[0] + np.linspace(0.0, 1.0, 33)[:, None] * (ends[1] - ends[0])
         # Kept for good: near 45 degrees the axis must not change from one frame to the next.
         span = np.abs(np.subtract(*to_raw(ends)))
         self._axis = 0 if span[0] >= span[1] else 1
         self._half_band = max(6, int(np.ceil(width_px / 2)))
-        section = self._section(luma, to_raw, self._half_band + 4)
+        section = self._section(luma, to_raw(self.axis_points), self._half_band + 4)
         if section is None:
             raise InputError(f"{name} lies outside the reference frame; move it onto the roof.")
         self.profile = _find_strip(section, self._half_band, name)
@@ -140,25 +153,28 @@ class LineTracker:
         return (np.arange(STATIONS) + 0.5) / STATIONS
 
     def find(self, luma: Luma, to_raw: Mapping, *, search_px: float | None = None) -> LineMatch:
-        """Return the line in a frame.
+        """Return the line in a frame; see `find_strips`."""
+        return find_strips([self], luma, to_raw, search_px=search_px)[0]
+
+    def search(self, luma: Luma, path: Floats, search_px: float | None) -> _Found:
+        """Return where the strip lies in a frame, good to a tenth of a pixel.
 
         Args:
-            luma: the frame.
-            to_raw: where the band should lie, as predicted.
-            search_px: how far the prediction may be wrong; None for half the band's width.
+            path: (n, 2) where its axis should lie, raw pixels.
+            search_px: as for `find_strips`.
         """
-        section = self._section(luma, to_raw, self._reach)
+        section = self._section(luma, path, self._reach)
         if section is None:
-            return NOT_FOUND
-        search = min(self._half_band, int(np.ceil(search_px if search_px is not None else self._half_band)))
-        offset, correlation = self._locate(section, search)
+            return _Found(None, 0.0)
+        reach = min(self._half_band, int(np.ceil(search_px if search_px is not None else self._half_band)))
+        offset, correlation = self._locate(section, reach)
         if correlation < LEAST_CORRELATION:
-            return LineMatch(edges_raw=NOT_FOUND.edges_raw, correlation=correlation)
-        return LineMatch(edges_raw=self._edges(section, offset), correlation=correlation)
+            return _Found(None, correlation)
+        line = section.across + self.profile.offset_px + self.profile.tilt_px * section.x + offset
+        return _Found(_Strip(section, line, self.profile), correlation)
 
-    def _section(self, luma: Luma, to_raw: Mapping, half: int) -> _Section | None:
-        """Cut the band out of a frame, or None where it leaves the frame almost everywhere."""
-        raw = to_raw(self._axis_points)
+    def _section(self, luma: Luma, raw: Floats, half: int) -> _Section | None:
+        """Cut the band about raw pixels (n, 2) out of a frame, or None where it leaves the frame almost everywhere."""
         if not np.isfinite(raw).all():
             return None
         axis = self._axis
@@ -199,33 +215,69 @@ class LineTracker:
         vertex = np.clip([_vertex(row, inner) - best for row in scores], -1.0, 1.0)
         return float(shifts[best] + _median_of_quarters(vertex + np.rint(middle) - middle)), float(score[best])
 
-    def _edges(self, section: _Section, offset: float) -> Floats:
-        """Return both edges (STATIONS, 2, 2) where the response to a derivative of a Gaussian is extreme."""
-        members = _membership(section.place)
-        line = section.across + self.profile.offset_px + self.profile.tilt_px * section.x + offset
+
+@dataclass(frozen=True)
+class _Strip:
+    """A strip that has been found in a frame.
+
+    Attributes:
+        line: (n,) its mid-line in each column of the section, good to a tenth of a pixel.
+    """
+
+    section: _Section
+    line: Floats
+    profile: StripProfile
+
+    @cached_property
+    def members(self) -> Floats:
+        """(STATIONS, n) share of each column that belongs to each station."""
+        return _membership(self.section.place)
+
+    def matched(self, shift: Floats, strength: Floats, correlation: float) -> LineMatch:
+        """Return the match that shifts (2, STATIONS) of both edges make, where they can be believed."""
+        profile, axis, members = self.profile, self.section.axis, self.members
         count = members.sum(axis=1)
         filled = np.maximum(count, 1e-9)
-        along, middle = members @ section.along / filled, members @ line / filled
+        along, middle = members @ self.section.along / filled, members @ self.line / filled
         wanted = 0.5 * np.median(count[count > 0])
-        side = np.array([[-1.0], [1.0]])
-        edge = line + side * self.profile.width_px / 2
-        slope_sign = -side * self.profile.polarity
-        shift, strength = _extremes(section, edge, members, slope_sign, self._scale_px())
-        good = (count >= wanted) & (np.abs(shift) < self._capture_px()) & (strength > 0.25 * self.profile.edge)
+        good = (count >= wanted) & (np.abs(shift) < profile.capture_px) & (strength > 0.25 * profile.edge)
         found = np.full((STATIONS, 2, 2), np.nan)
-        found[..., section.axis] = np.where(good, along, np.nan).T
-        found[..., 1 - section.axis] = np.where(good, middle + side * self.profile.width_px / 2 + shift, np.nan).T
-        width = found[:, 1, 1 - section.axis] - found[:, 0, 1 - section.axis]
-        wrong = ~(np.abs(width - self.profile.width_px) < 0.3 * self.profile.width_px + 0.7)
-        found[wrong] = np.nan
-        return found
+        found[..., axis] = np.where(good, along, np.nan).T
+        found[..., 1 - axis] = np.where(good, middle + SIDES * profile.width_px / 2 + shift, np.nan).T
+        width = found[:, 1, 1 - axis] - found[:, 0, 1 - axis]
+        found[~(np.abs(width - profile.width_px) < 0.3 * profile.width_px + 0.7)] = np.nan
+        return LineMatch(edges_raw=found, correlation=correlation)
 
-    def _scale_px(self) -> float:
-        """Width of the Gaussian whose derivative finds an edge: near a sharp picture's blur, under half the strip."""
-        return float(np.clip(self.profile.width_px / 5.0, 0.8, 1.5))
 
-    def _capture_px(self) -> float:
-        return min(3.0, 0.6 * self.profile.width_px)
+@dataclass(frozen=True)
+class _Found:
+    """A strip, or None where it was not recognised, and the correlation of its cross profile with the reference's."""
+
+    strip: _Strip | None
+    correlation: float
+
+
+def find_strips(
+    trackers: Sequence[LineTracker], luma: Luma, to_raw: Mapping, *, search_px: float | None = None
+) -> list[LineMatch]:
+    """Return the lines in a frame; all at once, since a frame's few hundred columns are little work.
+
+    Args:
+        luma: the frame.
+        to_raw: where the bands should lie, as predicted.
+        search_px: how far the prediction may be wrong; None for half each band's width.
+    """
+    paths = to_raw(np.concatenate([tracker.axis_points for tracker in trackers])).reshape(len(trackers), -1, 2)
+    found = [tracker.search(luma, path, search_px) for tracker, path in zip(trackers, paths, strict=True)]
+    strips = [one.strip for one in found if one.strip is not None]
+    shift, strength = _extremes(strips) if strips else (np.empty((0, 2, STATIONS)),) * 2
+    extremes = iter(zip(shift, strength, strict=True))
+    return [
+        LineMatch(NOT_FOUND.edges_raw, one.correlation)
+        if one.strip is None
+        else one.strip.matched(*next(extremes), one.correlation)
+        for one in found
+    ]
 
 
 def _profiles(luma: Luma, along: Floats, middle: NDArray[np.int64], half: int, axis: int) -> Singles:
@@ -268,47 +320,73 @@ def _membership(place: Floats) -> Floats:
     return share
 
 
-def _extremes(
-    section: _Section,
-    edge: Floats,
-    members: Floats,
-    slope_sign: Floats,
-    scale_px: float,
-) -> tuple[Floats, Floats]:
-    """Return, per edge and station (2, STATIONS), how far the edge lies from `edge` and its grey levels per pixel.
+def _extremes(strips: Sequence[_Strip]) -> tuple[Floats, Floats]:
+    """Return how far each edge lies from where its strip's mid-line says, and its grey levels per pixel.
 
     All columns of a station share one shift; it makes their summed response to a derivative of a Gaussian extreme.
     Found by Halley's method, which triples the correct digits with each step.
 
-    Args:
-        edge: (2, n) expected place of both edges in each column.
-        members: (STATIONS, n) share of each column that belongs to a station.
-        slope_sign: (2, 1) of each edge's slope.
+    Returns:
+        Shift and strength, (strips, 2, STATIONS).
     """
-    half = int(np.ceil(3.0 * scale_px)) + 1
+    columns = [len(strip.line) for strip in strips]
+    values, start, width = _side_by_side([strip.section for strip in strips])
+    expected = np.concatenate([_expected_edges(strip) for strip in strips], axis=1)
+    scale = np.repeat([strip.profile.scale_px for strip in strips], columns)
+    half = int(np.ceil(3.0 * scale.max())) + 1
     taps = np.arange(-half, half + 1)
-    powers = ((taps[:, None] / scale_px) ** np.arange(5)).astype(np.float32)
-    values, width = section.values.ravel(), section.values.shape[1]
-    rows = np.arange(len(section.across)) * width
-    expected = edge - (np.rint(section.across) - section.half)
-    shift, pooling = np.zeros((2, STATIONS)), members.astype(np.float32)
+    powers = (taps[:, None] ** np.arange(5)).astype(np.float32)
+    distance = (taps / scale[:, None]).astype(np.float32)
+    units = (scale ** -np.arange(5)[:, None]).astype(np.float32)[:, None]
+    pooling = [strip.members.astype(np.float32) for strip in strips]
+    by_station = np.array([strip.profile.scale_px for strip in strips])[:, None, None]
+    slope_sign = -SIDES * np.array([strip.profile.polarity for strip in strips])[:, None, None]
+    shift = np.zeros((len(strips), 2, STATIONS))
     for _ in range(HALLEY_STEPS):
-        position = expected + shift.astype(np.float32) @ pooling
+        position = expected + _to_columns(shift, pooling)
         nearest = np.clip(np.rint(position).astype(np.int64), half, width - 1 - half)
-        sample = values.take((rows + nearest)[..., None] + taps)
-        past = ((nearest - position) / scale_px).astype(np.float32)
-        gauss = np.exp(-0.5 * (past[..., None] + powers[:, 1]) ** 2)
-        by_column = _responses(past, _moments(gauss * sample, powers), _moments(gauss, powers[:, :3]))
-        response, first, second, third, power = (by_column @ pooling.T).astype(np.float64)
-        strength = slope_sign * response / np.maximum(power * scale_px, 1e-9)
+        sample = values.take((start + nearest)[..., None] + taps)
+        past = ((nearest - position) / scale).astype(np.float32)
+        gauss = np.exp(-0.5 * (past[..., None] + distance) ** 2)
+        own = units[:3] * _moments(gauss, powers[:, :3])
+        by_column = _responses(past, units * _moments(gauss * sample, powers), own)
+        response, first, second, third, power = _to_stations(by_column, pooling)
+        strength = slope_sign * response / np.maximum(power * by_station, 1e-9)
         curved = second * slope_sign < 0
         denominator = 2.0 * second**2 - first * third
         usable = curved & (denominator > 0.5 * second**2)
         halley = -2.0 * first * second / np.where(usable, denominator, 1.0)
         newton = -first / np.where(curved, second, 1.0)
-        step = np.where(usable, halley, np.where(curved, newton, 0.0)) * scale_px
+        step = np.where(usable, halley, np.where(curved, newton, 0.0)) * by_station
         shift += np.clip(step, -1.0, 1.0)
     return shift, np.where(curved & (np.abs(step) < 0.05), strength, 0.0)
+
+
+def _side_by_side(sections: Sequence[_Section]) -> tuple[Singles, NDArray[np.int64], NDArray[np.int64]]:
+    """Return the grey levels of sections one after another, and where each column of n begins and how long it is."""
+    values = np.concatenate([section.values.ravel() for section in sections])
+    width = np.repeat([section.values.shape[1] for section in sections], [len(one.across) for one in sections])
+    return values, np.cumsum(width) - width, width
+
+
+def _expected_edges(strip: _Strip) -> Floats:
+    """Return where both edges (2, n) should lie within the columns of the strip's section."""
+    return strip.line + SIDES * strip.profile.width_px / 2 - (np.rint(strip.section.across) - strip.section.half)
+
+
+def _to_columns(by_station: Floats, pooling: Sequence[Singles]) -> Singles:
+    """Return (2, n) of values (strips, 2, STATIONS), shared out among the columns of each strip."""
+    parts = zip(by_station.astype(np.float32), pooling, strict=True)
+    return np.concatenate([part @ members for part, members in parts], axis=1)
+
+
+def _to_stations(by_column: Singles, pooling: Sequence[Singles]) -> Floats:
+    """Return (m, strips, 2, STATIONS) of values (m, 2, n), summed over the columns of each station."""
+    ends = np.cumsum([members.shape[1] for members in pooling])
+    # As one matrix: products of many small ones take several times as long.
+    parts = zip(np.split(by_column.reshape(-1, ends[-1]), ends[:-1], axis=1), pooling, strict=True)
+    sums = [(part @ members.T).reshape(-1, 2, STATIONS) for part, members in parts]
+    return np.stack(sums, axis=1).astype(np.float64)
 
 
 def _moments(weighted: Singles, powers: Singles) -> Singles:

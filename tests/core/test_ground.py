@@ -168,7 +168,8 @@ def test_no_homography_from_a_spot_a_line_or_three_points(source: Floats) -> Non
 def test_where_features_should_be_and_how_deformed() -> None:
     camera = pose((0.02, 0.03, 0.1), (0.6, -0.4, -0.5))
     H = true_homography(camera)
-    predicted, ref_from_current = ground_tracker().predict(H)
+    found = ground_tracker().predict(H)
+    predicted, ref_from_current = found.raw, found.ref_from_current
     expected = LENS.raw_from_rays(apply_homography(H, LENS.rays_from_raw(features())))
     np.testing.assert_allclose(predicted, expected, atol=1e-9)
     # A step in the frame is a step in the reference frame: the inverse way, numerically.
@@ -176,6 +177,9 @@ def test_where_features_should_be_and_how_deformed() -> None:
         back = apply_homography(invert_homography(H), LENS.rays_from_raw(predicted + step))
         moved = LENS.raw_from_rays(back) - features()
         np.testing.assert_allclose(np.einsum("nij,j->ni", ref_from_current, step), moved, atol=1e-5)
+    # A feature found a pixel beside is seen along the ray that the lens gives, to a thousandth of a pixel.
+    beside = predicted + [0.8, -0.6]
+    np.testing.assert_allclose(found.rays_seen(beside), LENS.rays_from_raw(beside), atol=1e-3 / 400)
 
 
 @pytest.mark.parametrize("known", [True, False])
