@@ -36,9 +36,12 @@ READ_AHEAD = 6
 # A decoder's threads wait for each other and for whoever takes the frames: several for each core keep it busy.
 THREADS_PER_CORE = 3
 MOST_THREADS = 16
-# What is larger is a picture; glibc's number for the size from which memory is the system's and not an arena's.
+# What is larger is a picture: its memory is the system's and not an arena's. What is smaller is needed again for the
+# next frame, so an arena keeps some of it. The other two are glibc's numbers for these settings.
 PICTURE_BYTES = 1 << 20
+KEPT_BYTES = 1 << 24
 _M_MMAP_THRESHOLD = -3
+_M_TRIM_THRESHOLD = -1
 EIGHT_BIT_LUMA = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 
 
@@ -262,6 +265,7 @@ def _give_pictures_back() -> None:
     """Have the memory of pictures go back to the system when they do; glibc would keep it for threads that are gone."""
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(_M_MMAP_THRESHOLD, PICTURE_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES)
 
 
 def read_frames(
