@@ -7,6 +7,8 @@ once, when its task has finished, and nothing is counted twice.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
+from types import TracebackType
+from typing import Any
 
 from core.chunks import Chunk
 from core.errors import InputError
@@ -20,38 +22,67 @@ RETRIES = 3
 ChunkWork = Callable[[bytes, Chunk], list[FrameMeasurement]]
 
 
-def measure_on_cluster(
-    work: ChunkWork, eyes: bytes, divide: Callable[[int], Sequence[Chunk]], frames: int, scheduler: str
-) -> Generator[FrameMeasurement, None, None]:
-    """Yield the measurements of chunks as their tasks finish, frames of a chunk in order.
+class Cluster:
+    """Dask's workers, which load what they will need from now on; a context, at whose end the connection is closed.
 
     Args:
         work: what a task does.
-        eyes: what it does that with.
-        divide: cuts what is to be measured into about so many chunks.
-        frames: of the video.
         scheduler: address, such as `tcp://127.0.0.1:8786`.
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers.
     """
-    try:
-        from distributed import Client, as_completed
-    except ImportError:
-        raise InputError("--scheduler needs Dask; install it with `pip install rooftrack[cluster]`.") from None
-    try:
-        client = Client(scheduler, timeout=10, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error}); start one.") from None
-    with client:
+
+    def __init__(self, work: ChunkWork, scheduler: str) -> None:
+        try:
+            from distributed import Client
+        except ImportError:
+            raise InputError("--scheduler needs Dask; install it with `pip install rooftrack[cluster]`.") from None
+        try:
+            self._client: Any = Client(scheduler, timeout=10, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"--scheduler {scheduler}: no Dask scheduler answers there ({error}); start one."
+            ) from None
+        self._work = work
+        # Nobody waits for these: a worker that is not there any more, or not yet, loads with its first task.
+        self._loading = [
+            self._client.submit(_load, work, workers=[worker], pure=False) for worker in self._client.nthreads()
+        ]
+
+    def __enter__(self) -> Cluster:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._client.close()
+
+    def measure(
+        self, eyes: bytes, divide: Callable[[int], Sequence[Chunk]], frames: int
+    ) -> Generator[FrameMeasurement, None, None]:
+        """Yield the measurements of chunks as their tasks finish, frames of a chunk in order.
+
+        Args:
+            eyes: what the tasks' work is done with.
+            divide: cuts what is to be measured into about so many chunks.
+            frames: of the video.
+        """
+        from distributed import as_completed
+
+        client = self._client
         chunks = divide(tasks_for(frames, sum(client.nthreads().values())))
-        futures = [client.submit(work, eyes, chunk, pure=False, retries=RETRIES) for chunk in chunks]
+        futures = [client.submit(self._work, eyes, chunk, pure=False, retries=RETRIES) for chunk in chunks]
         try:
             # Its loop must be named: this client is nobody's default.
             for future in as_completed(futures, loop=client.loop):
                 yield from future.result()
         finally:
             client.cancel(futures)
+
+
+def _load(work: ChunkWork) -> None:
+    """Do nothing: to receive its argument a worker imports what the work needs."""
 
 
 def tasks_for(frames: int, workers: int) -> int:

@@ -17,7 +17,7 @@ from typing import Protocol
 import cv2
 
 from core.chunks import HEAD_START, WARM_UP, Chunk, missing_chunks
-from core.cluster import measure_on_cluster
+from core.cluster import Cluster
 from core.following import CONFIRM_EVERY, make_follower
 from core.ground import FEATURES, GroundTracker, choose_features, ground_mask
 from core.measurements import FrameMeasurement, MeasurementStore, Reference
@@ -101,12 +101,14 @@ def measure_chunk(
         before: the last two frames before the chunk, where known; otherwise the chunk finds its own way in.
         threads: decoder threads, as `FramesAhead`.
         index: of the video, where it is known already.
-        begun: the chunk's frames, where decoding them has begun already.
+        begun: frames from the chunk's first on, where decoding them has begun already.
     """
     first = chunk.start if before else max(0, chunk.start - WARM_UP)
     history = list(before)[-2:]
     with begun or FramesAhead(setup.video, first, chunk.stop, threads=threads, index=index) as frames:
         for frame in frames:
+            if frame.index == chunk.stop:
+                return
             measured = measurer.measure(frame.luma, frame=frame.index, time_s=frame.time_s, before=history)
             history = [*history[-1:], measured]
             if frame.index >= chunk.start:
@@ -147,12 +149,13 @@ def measure(
     if recording is not None and store.is_finished(recording):
         return recording
     with ExitStack() as stack:
-        # A whole clip is being decoded while its timestamps and its reference frame are still looked at.
-        is_whole = recording is None and workers == 1 and scheduler is None
-        begun = stack.enter_context(FramesAhead(setup.video)) if is_whole else None
+        # While timestamps and reference frame are still looked at, others load and the first chunk is being decoded.
+        cluster = stack.enter_context(Cluster(measure_remotely, scheduler)) if scheduler is not None else None
+        is_new = recording is None and cluster is None
+        begun = stack.enter_context(FramesAhead(setup.video, threads=min(workers - 1, 1))) if is_new else None
         index = frame_index(setup.video)
         done = [] if recording is None else store.measured_frames(recording)
-        chunks = missing_chunks(done, index, workers, HEAD_START) if scheduler is None else []
+        chunks = missing_chunks(done, index, workers, HEAD_START) if cluster is None else []
         before = [_before(store, recording, chunk.start) for chunk in chunks]
         helping = max(0, min(workers, len(chunks)) - 1)
         helpers = stack.enter_context(Helpers(measure_order, helping))
@@ -161,7 +164,6 @@ def measure(
         if recording is None:
             recording = store.begin(setup.method, setup.fingerprint, measurer.reference)
         eyes = pickle.dumps(Eyes(setup, index, measurer))
-        threads = 1 if helping else 0
 
         def own(order: Order) -> Iterator[FrameMeasurement]:
             return measure_chunk(
@@ -169,18 +171,16 @@ def measure(
                 order.chunk,
                 measurer=measurer,
                 before=order.before,
-                threads=threads,
+                threads=min(helping, 1),
                 index=index,
-                begun=begun,
+                begun=begun if order.chunk == chunks[0] else None,
             )
 
-        if scheduler is None:
+        if cluster is None:
             orders = [Order(eyes, chunk, known) for chunk, known in zip(chunks, before, strict=True)]
             source = helpers.measure(orders, own)
         else:
-            source = measure_on_cluster(
-                measure_remotely, eyes, lambda parts: missing_chunks(done, index, parts), len(index), scheduler
-            )
+            source = cluster.measure(eyes, lambda parts: missing_chunks(done, index, parts), len(index))
         _take_over(source, store, recording, len(done), len(index), progress, cancel)
     store.finish(recording)
     return recording
