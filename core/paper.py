@@ -36,9 +36,9 @@ from core.video import Luma
 # Matches per frame of the paper: 300-500.
 FEATURES = 500
 LEAST_MATCHES = 20
-# Half the side of the window SIFT looks into around an expected feature, pixels: the support of its descriptor at the
-# scales kept, and two pixels of prediction error.
-WINDOW_PX = 28
+# Half the side of the window SIFT looks into around an expected feature, pixels: where a descriptor's weight lies at
+# the scales kept, and what a match may lie off. Wider windows match no more features.
+WINDOW_PX = 20
 LARGEST_SIZE_PX = 5.0
 # How far from its expected place a match may lie, pixels.
 NEAR_PX = 4.0
@@ -99,19 +99,24 @@ class SiftGround:
 
     def find(self, luma: Luma, predicted_H_ray_ray0: Floats | None) -> tuple[Floats, Floats] | None:
         """Return H_ray_ray0 and the matched features' raw pixels (N, 2), nan where unmatched; None if lost."""
-        for searching in (False, True):
-            H_guess = self._finder.search(luma) if searching else predicted_H_ray_ray0
-            if H_guess is None:
-                continue
-            matched = self._match(luma, self._lens.raw_from_rays(apply_homography(H_guess, self._rays0)))
-            good = np.isfinite(matched).all(axis=1)
-            if good.sum() < LEAST_MATCHES:
-                continue
-            rays = self._lens.rays_from_raw(matched[good])
-            H, inlier = fit_homography(self._rays0[good], rays, tolerance=1.0 / float(self._lens.focal_px.mean()))
-            if H is not None and inlier.sum() >= LEAST_MATCHES:
-                return H, matched
-        return None
+        if predicted_H_ray_ray0 is None:
+            # A hovering camera may well see what it saw in the reference frame; by chance few features seem to match.
+            found = self._fit(luma, np.eye(3), len(self._rays0) // 2)
+        else:
+            found = self._fit(luma, predicted_H_ray_ray0)
+        if found is None and (searched := self._finder.search(luma)) is not None:
+            found = self._fit(luma, searched)
+        return found
+
+    def _fit(self, luma: Luma, H_ray_ray0: Floats, least: int = LEAST_MATCHES) -> tuple[Floats, Floats] | None:
+        """Return what `find` does from where a homography leads one to expect the features, or None."""
+        matched = self._match(luma, self._lens.raw_from_rays(apply_homography(H_ray_ray0, self._rays0)))
+        good = np.isfinite(matched).all(axis=1)
+        if good.sum() < max(least, LEAST_MATCHES):
+            return None
+        rays = self._lens.rays_from_raw(matched[good])
+        H, inlier = fit_homography(self._rays0[good], rays, tolerance=1.0 / float(self._lens.focal_px.mean()))
+        return None if H is None or inlier.sum() < max(least, LEAST_MATCHES) else (H, matched)
 
     def _match(self, luma: Luma, expected_raw: Floats) -> Floats:
         """Return each feature's match (N, 2) among those found within the window around its expected place."""
