@@ -34,7 +34,7 @@ from sample_data.tables import README, markdown_table, write_between_markers
 
 CACHE = Path("workspace/accuracy")
 Size = tuple[int, int]
-SIZE = re.compile(r"\d+x\d+")
+SIZE, SECONDS = re.compile(r"\d+x\d+"), re.compile(r"[\d.]+s")
 TRUTH_FILE = "truth.npz"
 # The paper's corner frequencies, and RMS it reports after filtering.
 PAPER_CORNER_HZ = {"eq5": 0.3, "eq5_slow_drift": 0.3}
@@ -70,6 +70,47 @@ LIMITS: Mapping[str, Limit] = {
 NO_LIMIT = Limit(None)
 USUAL_SCENES = (*LIMITS, "mid_shaking", "fps60", "fps120", "portrait", "points_roof", "two_targets", "rolling_shutter")
 PAPER_SCENES = ("eq5_slow_drift", "eq7_slow_drift")
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A rendered scene.
+
+    Attributes:
+        scene: name in the catalogue.
+        size, seconds, preset: of the encoder, where they are not the scene's own.
+    """
+
+    scene: str
+    seed: int
+    size: Size | None = None
+    seconds: float | None = None
+    preset: str | None = None
+
+    @property
+    def folder(self) -> str:
+        """Name of the folder it is kept in; see `in_folder`."""
+        size = f"{self.size[0]}x{self.size[1]}" if self.size else ""
+        seconds = f"{self.seconds:g}s" if self.seconds else ""
+        return "-".join(part for part in (self.scene, str(self.seed), size, seconds, self.preset) if part)
+
+    @property
+    def row(self) -> str:
+        """Name of the row of the table in which clips of several seeds come together."""
+        size = f"{self.size[0]}×{self.size[1]}" if self.size else ""
+        return ", ".join(part for part in (self.scene, size, self.preset) if part)
+
+    @staticmethod
+    def in_folder(name: str) -> Clip | None:
+        """Return the clip that a folder of this name holds, or None if it holds none."""
+        scene, _, rest = name.partition("-")
+        seed, *parts = rest.split("-")
+        if not seed.isdigit():
+            return None
+        size = next((_size(part) for part in parts if SIZE.fullmatch(part)), None)
+        seconds = next((float(part[:-1]) for part in parts if SECONDS.fullmatch(part)), None)
+        preset = next((part for part in parts if part.isalpha()), None)
+        return Clip(scene, int(seed), size, seconds, preset)
 
 
 @dataclass(frozen=True)
@@ -131,17 +172,14 @@ class PaperScore:
 # --- one clip --------------------------------------------------------------------------------------------------------
 
 
-def rendered(name: str, seed: int, size: Size | None, seconds: float | None, cache: Path) -> Path:
-    """Return the folder of a scene, rendered if it is not there yet."""
-    label = f"{name}-{seed}"
-    label += f"-{size[0]}x{size[1]}" if size else ""
-    label += f"-{seconds:g}s" if seconds else ""
-    folder = cache / label
+def rendered(clip: Clip, cache: Path) -> Path:
+    """Return the folder of a clip, rendered if it is not there yet."""
+    folder = cache / clip.folder
     if (folder / "video.mp4").exists() and (folder / TRUTH_FILE).exists():
         return folder
-    unfinished = cache / f".{label}"
-    scene = build(name, seed=seed, size_px=size, duration_s=seconds)
-    make(scene, unfinished, lambda done, total: _say(f"{label}: rendering frame {done} of {total}"))
+    unfinished = cache / f".{clip.folder}"
+    scene = build(clip.scene, seed=clip.seed, size_px=clip.size, duration_s=clip.seconds, preset=clip.preset)
+    make(scene, unfinished, lambda done, total: _say(f"{clip.folder}: rendering frame {done} of {total}"))
     unfinished.rename(folder)
     return folder
 
@@ -175,11 +213,11 @@ def true_displacement(truth: Mapping[str, NDArray[np.float64]], name: str, rest_
     return np.asarray(motion[:, None, :2] + turned)
 
 
-def score(name: str, inputs: LoadedInputs, keep: bool, size: Size | None = None) -> list[Score]:
-    """Measure a scene and return the errors of each of its targets; `size` where it is not the scene's own."""
+def score(clip: Clip, inputs: LoadedInputs, keep: bool) -> list[Score]:
+    """Measure a clip and return the errors of each of its targets."""
     truth = dict(np.load(inputs.folder / TRUTH_FILE))
     recording, solution, frame_ms = measured(inputs, keep=keep)
-    noise, camera_by_bound = SCENES[name].noise, np.nan
+    noise, camera_by_bound = SCENES[clip.scene].noise, np.nan
     if solution.flight is not None:
         ratios = solution.flight.noise_m / camera_bound(inputs, recording, solution, noise)
         camera_by_bound = float(ratios[:2].mean())
@@ -190,9 +228,8 @@ def score(name: str, inputs: LoadedInputs, keep: bool, size: Size | None = None)
         true = true_displacement(truth, target.name, rest, target.kind)
         alone = target.relative_to is None
         bound_m = displacement_bound(inputs, recording, solution, target, noise) if alone else np.nan
-        label = name if size is None else f"{name}, {size[0]}×{size[1]}"
-        label += f": {target.name}" if len(inputs.project.targets) > 1 else ""
-        one = _scored(label, history, true, truth["hidden"], inputs.project.intervals_s, bound_m, frame_ms, name)
+        label = clip.row + (f": {target.name}" if len(inputs.project.targets) > 1 else "")
+        one = _scored(label, history, true, truth["hidden"], inputs.project.intervals_s, bound_m, frame_ms, clip.scene)
         scores.append(replace(one, camera_by_bound=camera_by_bound))
     return scores
 
@@ -362,14 +399,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     papers: list[PaperScore] = []
     wanted = [name for name in chosen.scenes.split(",") if name]
     for name, is_paper in _rounds(wanted, chosen.paper):
-        for seed, size in _clips(name, chosen):
-            inputs = load_inputs(rendered(name, seed, size, chosen.seconds, chosen.cache))
+        for clip in _clips(name, chosen):
+            inputs = load_inputs(rendered(clip, chosen.cache))
             if is_paper:
                 papers.append(score_paper(name, inputs, chosen.keep))
-                _say(f"{name}-{seed}: the published way\n{paper_table(papers[-1:])}\n")
+                _say(f"{clip.folder}: the published way\n{paper_table(papers[-1:])}\n")
             else:
-                scores += (new := score(name, inputs, chosen.keep, size))
-                _say(f"{name}-{seed}: {new[0].frame_ms:.0f} ms a frame\n{table(new)}\n")
+                scores += (new := score(clip, inputs, chosen.keep))
+                _say(f"{clip.folder}: {new[0].frame_ms:.0f} ms a frame\n{table(new)}\n")
     text = "\n\n".join(
         part for part in (table(scores) if scores else "", paper_table(papers) if papers else "") if part
     )
@@ -382,17 +419,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if missed else 0
 
 
-def _clips(name: str, chosen: argparse.Namespace) -> list[tuple[int, Size | None]]:
-    """Return seeds and sizes of a scene's clips: those asked for, or those that lie in the cache."""
+def _clips(scene: str, chosen: argparse.Namespace) -> list[Clip]:
+    """Return the clips of a scene that are asked for, or those that lie in the cache."""
     if not chosen.rendered:
         size = _size(chosen.size) if chosen.size else None
-        return [(int(part), size) for part in chosen.seeds.split(",")]
-    found = []
-    for video in sorted(chosen.cache.glob(f"{name}-*/video.mp4")):
-        seed, _, size = video.parent.name.removeprefix(f"{name}-").partition("-")
-        if seed.isdigit() and (not size or SIZE.fullmatch(size)):
-            found.append((int(seed), _size(size) if size else None))
-    return found
+        return [Clip(scene, int(seed), size, chosen.seconds, chosen.preset) for seed in chosen.seeds.split(",")]
+    found = [Clip.in_folder(video.parent.name) for video in sorted(chosen.cache.glob(f"{scene}-*/video.mp4"))]
+    return [clip for clip in found if clip is not None]
 
 
 def _size(text: str) -> Size:
@@ -410,10 +443,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--paper", default=",".join(PAPER_SCENES), help="scenes measured the published way too")
     parser.add_argument("--seeds", default="1")
     parser.add_argument(
-        "--rendered", action="store_true", help="take the clips of whatever seeds that lie in the cache"
+        "--rendered", action="store_true", help="take the clips of whatever seed, size or preset that lie in the cache"
     )
     parser.add_argument("--size", help="WIDTHxHEIGHT of the videos; the field of view stays")
     parser.add_argument("--seconds", type=float, help="length of the clips")
+    parser.add_argument("--preset", help="of the encoder, such as medium")
     parser.add_argument("--cache", type=Path, default=CACHE, help="where rendered scenes are kept")
     parser.add_argument("--keep", action="store_true", help="take earlier measurements: only the solving is on trial")
     parser.add_argument("--write", action="store_true", help="put the table into the README")

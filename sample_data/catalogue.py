@@ -80,9 +80,14 @@ class Brief:
 
 
 def build(
-    name: str, *, seed: int = 1, size_px: tuple[int, ...] | None = None, duration_s: float | None = None
+    name: str,
+    *,
+    seed: int = 1,
+    size_px: tuple[int, ...] | None = None,
+    duration_s: float | None = None,
+    preset: str | None = None,
 ) -> Scene:
-    """Return a scene of the catalogue, perhaps in another size or length.
+    """Return a scene of the catalogue, perhaps in another size or length, or by another preset of the encoder.
 
     Raises:
         KeyError: no scene has this name.
@@ -99,6 +104,9 @@ def build(
             post_event_s=brief.post_event_s * share,
             starts_s=brief.starts_s * share,
         )
+    if preset is not None:
+        options = {**brief.recording.options, "preset": preset}
+        brief = replace(brief, recording=replace(brief.recording, options=options))
     return compose(name, brief, seed)
 
 

@@ -31,12 +31,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--size", help="WIDTHxHEIGHT of the video, upright; the field of view stays")
     parser.add_argument("--seconds", type=float, help="length of the clip")
+    parser.add_argument("--preset", help="of the encoder, such as medium; the scene's own if left out")
     parser.add_argument("--threads", type=int, default=2, help="of image operations")
     parser.add_argument("--shipped", action="store_true", help="leave out truth.npz, which only tests read")
     chosen = parser.parse_args(arguments)
     cv2.setNumThreads(chosen.threads)
     size = tuple(int(part) for part in chosen.size.split("x")) if chosen.size else None
-    scene = build(chosen.scene, seed=chosen.seed, size_px=size, duration_s=chosen.seconds)
+    scene = build(chosen.scene, seed=chosen.seed, size_px=size, duration_s=chosen.seconds, preset=chosen.preset)
     started = time.monotonic()
 
     def watch(done: int, total: int) -> None:
