@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -274,6 +275,38 @@ def test_a_chunk_may_begin_anywhere(clip, history, tmp_path, monkeypatch):
     monkeypatch.setattr(measuring, "missing_chunks", lambda done, index, parts, head_start: chunks)
     folder = project_copy(clip, tmp_path / "pieces")
     assert largest_difference_m(measured_history(folder, workers=2), history) < SAME_M
+
+
+MEMORY_OF_A_RUN = """
+import shutil, sys
+from pathlib import Path
+from core.measure import measure
+from core.measurements import MeasurementStore
+from core.run import load_inputs
+
+held = {}
+def watch(stage, done, total):
+    if done in (150, total):
+        status = Path("/proc/self/status").read_text()
+        held[done] = int(status.split("VmRSS:")[1].split()[0]) / 1024
+
+folder = Path(sys.argv[1])
+with MeasurementStore(folder / "frames.sqlite") as store:
+    measure(load_inputs(folder).setup(), store, progress=watch)
+print(*held, *held.values())
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="this system does not tell")
+def test_memory_stays_the_same_however_long_the_clip(tmp_path):
+    folder = tmp_path / "sample"
+    shutil.copytree(ROOT / "sample_data" / "sample", folder)
+    ended = program(MEMORY_OF_A_RUN, folder)
+    assert ended.returncode == 0, ended.stderr
+    early, late, early_mb, late_mb = map(float, ended.stdout.split())
+    frame_mb = 960 * 540 * 1.5 / 2**20
+    assert late_mb - early_mb < 0.1 * (late - early) * frame_mb
+    assert late_mb < 400
 
 
 # --- measure once, solve many times ----------------------------------------------------------------------------------
