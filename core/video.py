@@ -180,6 +180,11 @@ def _frame_index(path: File, state: FileState) -> FrameIndex:
         tick_s = float(stream.time_base or 0)
     if not ticks:
         raise InputError(f"{path}: its video stream holds no frames; export the video again.")
+    if repeated := len(ticks) - len(set(ticks)):
+        raise InputError(
+            f"{path}: {repeated} of its {len(ticks)} frames bear the time of another; export the video again, with "
+            "timestamps that increase from frame to frame."
+        )
     return FrameIndex(ticks=tuple(sorted(ticks)), key_ticks=tuple(sorted(keys)), tick_s=tick_s)
 
 

@@ -206,6 +206,12 @@ def test_sound_alone(tmp_path: Path) -> None:
         probe(file)
 
 
+def test_frames_without_times_of_their_own(tmp_path: Path) -> None:
+    file = write(tmp_path / "repeated.mkv", frames=5, codec="ffv1", ticks=[0, 40, 40, 80, 80])
+    with pytest.raises(InputError, match="2 of its 5 frames bear the time of another; export the video again"):
+        frame_index(file)
+
+
 def test_frames_beyond_the_end(video: Path) -> None:
     with pytest.raises(InputError, match="has 50 frames, so there is no frame 50"):
         list(read_frames(video, FRAMES))
