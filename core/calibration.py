@@ -229,8 +229,7 @@ class _Trials:
         origin_m, relief = evidence.reference.origin_m, evidence.relief
         points = ground_points(raw, used.lens, used.pose0, origin_m, relief)
         rays = used.lens.rays_from_raw(self._frames.ground_raw + used.lag_s * self._speed)
-        weight = np.where(np.isfinite(points).all(axis=1), self._start.weight, 0.0)
-        poses = fit_poses(rays, weight, np.nan_to_num(points), self._start, iterations=TRIAL_ITERATIONS, robust=False)
+        poses = fit_poses(rays, self._start.weight, points, self._start, iterations=TRIAL_ITERATIONS, robust=False)
         return _Trial(used, poses)
 
     def motion(self, correction: Floats) -> Floats:

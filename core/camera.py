@@ -156,7 +156,7 @@ def fit_poses(
     Args:
         rays: (F, N, 2) observed, nan where not observed.
         weight: (F, N) prior weights: inverse variances in any unit, 0 where not to be used.
-        points_m: (N, 3) world.
+        points_m: (N, 3) world, nan where not known.
         start: one pose for all frames, or an earlier fit of the same frames.
         robust: whether to weigh down outliers (Tukey's biweight on a median scale).
         sigma_floor: smallest scale of the robust weights, rays.
@@ -170,6 +170,8 @@ def fit_poses(
     if fixed_centre_m is not None:
         C0 = fixed_centre_m
     unknowns = 3 if fixed_centre_m is not None else 6
+    weight = np.where(finite_rows(points_m), weight, 0.0)
+    points_m = np.nan_to_num(points_m)
     parts = [
         _fit_batch(
             rays[s], weight[s], points_m, R0[s], C0[s],

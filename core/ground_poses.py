@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 from numpy.typing import NDArray
 
-from core.camera import Pose, PoseFit, fit_poses, intersect_height, plan_homographies
+from core.camera import Pose, PoseFit, fit_poses, intersect_height, plan_homographies, project
 from core.coordinates import Bools, Floats, evenly_spread, finite_median
 from core.georeference import ReferenceFit, fit_reference
 from core.lens import Lens
 from core.measurements import Recording
+from core.patches import HALF_PX
 from core.project import Project
 from core.relief import Relief
 from core.solution import Ground
@@ -18,6 +21,11 @@ from core.solution import Ground
 LEAST_GROUND = 20
 # No ground feature is believed to be steadier than this part of the usual one.
 LEAST_SCATTER = 0.3
+# A feature that lies further from the ground stands on it, if that is told by so many standard deviations.
+STANDING_M = 0.3
+STANDING_SIGMA = 4.0
+STANDING_FRAMES = 150
+STANDING_ROUNDS = 4
 # Frames, evenly spread, that say how steady a feature is.
 TRUST_FRAMES = 1000
 # Least scatter of ground points at which outliers are told, pixels.
@@ -54,6 +62,16 @@ def ground_points(raw: Floats, lens: Lens, pose0: Pose, origin_m: Floats, relief
     return np.column_stack([xy, z])
 
 
+def _on_ground(raw: Floats, lens: Lens, pose0: Pose, origin_m: Floats, relief: Relief | None) -> Bools:
+    """Return which features (N,) seen at raw reference pixels (N, 2) show the ground and nothing that stands on it."""
+    if relief is None:
+        return np.ones(len(raw), dtype=bool)
+    reach = HALF_PX * float(pose0.centre_m[2]) / float(lens.focal_px.mean())
+    shown = relief.shows_ground(lens.rays_from_raw(raw), pose0, origin_m, reach)
+    # A cloud that shows next to no ground where the camera looks is another day's, or another site's.
+    return shown if shown.sum() >= 2 * LEAST_GROUND else np.ones(len(raw), dtype=bool)
+
+
 def solve_ground(
     recording: Recording,
     lens: Lens,
@@ -70,12 +88,13 @@ def solve_ground(
     """
     points = ground_points(recording.reference.ground_raw, lens, pose0, origin_m, relief)
     rays = lens.rays_from_raw(recording.ground_raw)
-    weight = np.isfinite(points).all(axis=1) * np.ones(len(rays))[:, None]
+    on_ground = _on_ground(recording.reference.ground_raw, lens, pose0, origin_m, relief)
+    weight = on_ground * np.ones(len(rays))[:, None]
     focal = float(lens.focal_px.mean())
     least = LEAST_SIGMA_PX / focal
-    poses = fit_poses(rays, weight, np.nan_to_num(points), pose0, sigma_floor=least)
-    trusted = weight * _trust(poses)
-    poses = fit_poses(rays, trusted, np.nan_to_num(points), poses, iterations=4, sigma_floor=least)
+    poses = fit_poses(rays, weight, points, pose0, sigma_floor=least)
+    trusted = weight * _trust(poses) * ~_standing(rays, weight, points, poses, pose0, least)
+    poses = fit_poses(rays, trusted, points, poses, iterations=4, sigma_floor=least)
     agreeing = np.where(trusted > 0, poses.weight / np.maximum(trusted, 1e-300), 0.0)
     inlier = agreeing > 0.1
     squared = np.where(inlier, (np.nan_to_num(poses.residual) ** 2).sum(axis=-1), 0.0)
@@ -104,6 +123,43 @@ def _change_px(ground_raw: Floats, frames: NDArray[np.int64]) -> Floats:
     return 1.4826 * finite_median(np.abs(moved - finite_median(moved)[..., None]).reshape(len(frames), -1))
 
 
+def _standing(rays: Floats, weight: Floats, points_m: Floats, poses: PoseFit, pose0: Pose, least_sigma: float) -> Bools:
+    """Return which ground features (N,) move, wherever the camera does, like something high above the ground.
+
+    A car that came after the scan is in no point cloud; its features lie at another height along their line of sight.
+    They pull the poses along, so what stands out at first is taken away before the next are looked for.
+
+    Args:
+        least_sigma: of any feature in a frame, rays.
+    """
+    some = evenly_spread(len(rays), STANDING_FRAMES)
+    rays, weight = rays[some], weight[some] * _trust(poses)
+    poses = PoseFit(*(getattr(poses, each.name)[some] for each in fields(poses)))
+    standing = np.zeros(len(points_m), dtype=bool)
+    for _ in range(STANDING_ROUNDS):
+        height, sigma = _heights(points_m, poses, pose0, least_sigma)
+        usual = np.where(standing, np.nan, height)
+        spread = 1.4826 * finite_median(np.abs(usual - finite_median(usual)))
+        found = standing | (np.abs(height) > np.maximum(STANDING_M, STANDING_SIGMA * np.maximum(sigma, spread)))
+        if (found == standing).all():
+            break
+        standing = found
+        poses = fit_poses(rays, weight * ~standing, points_m, poses, iterations=4)
+    return standing
+
+
+def _heights(points_m: Floats, poses: PoseFit, pose0: Pose, least_sigma: float) -> tuple[Floats, Floats]:
+    """Return how high above their places (N,) features seem to lie, and its standard deviation, metres."""
+    a_metre_higher = points_m + (pose0.centre_m - points_m) / (pose0.centre_m[2] - points_m[:, 2:])
+    J = project(poses.R, poses.centre_m, a_metre_higher) - project(poses.R, poses.centre_m, points_m)
+    seen = np.isfinite(poses.residual) & np.isfinite(J)
+    J, residual = np.where(seen, J, 0.0), np.where(seen, poses.residual, 0.0)
+    power = (J * J).sum(axis=(0, 2))
+    height = (J * residual).sum(axis=(0, 2)) / np.maximum(power, 1e-300)
+    left_over = ((residual - J * height[:, None]) ** 2).sum(axis=(0, 2)) / np.maximum(seen.sum(axis=(0, 2)) - 1, 1)
+    return height, np.sqrt(np.maximum(left_over, least_sigma**2) / np.maximum(power, 1e-300))
+
+
 def _trust(poses: PoseFit) -> Floats:
     """Return the relative weight (N,) of ground features from how steadily each agrees with all others.
 
@@ -113,5 +169,7 @@ def _trust(poses: PoseFit) -> Floats:
     own = residual - finite_median(np.moveaxis(residual, 0, -1))
     sigma = 1.4826 * finite_median(np.moveaxis(np.abs(own), 1, 0).reshape(own.shape[1], -1))
     known = sigma > 0
-    usual = float(np.median(sigma[known])) if known.any() else 1.0
+    if not known.any():
+        return np.ones(len(sigma))
+    usual = float(np.median(sigma[known]))
     return np.where(known, (usual / np.maximum(sigma, LEAST_SCATTER * usual)) ** 2, 0.0)

@@ -2,7 +2,8 @@
 
 The datum is the horizontal plane at the height of the fitted ground plane below the target, so that `height_m` means
 height above the ground there. A kerb of four centimetres seen askew from forty metres moves by millimetres; with the
-LiDAR's own elevations it stays where it is.
+LiDAR's own elevations it stays where it is. A container two metres high would move by centimetres: what stands on the
+ground is kept as well, so that nobody takes its features for the ground's.
 """
 
 from __future__ import annotations
@@ -12,15 +13,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, maximum_filter
 
-from core.cloud import Cloud, GroundPlane, ground_elevation
-from core.coordinates import Floats, read_only
+from core.camera import Pose, intersect_height
+from core.cloud import RELIEF_REACH_M, Cloud, GroundPlane, ground_elevation
+from core.coordinates import Bools, Floats, read_only
 from core.project import write_atomically
 
 CELL_M = 0.25
 # A site larger than this is rasterised more coarsely, so that it never takes longer than a few seconds.
 MOST_CELLS = 120_000
+# What is seen along a line of sight is looked for at heights so far apart.
+SIGHT_STEP_M = 0.25
 
 
 @dataclass(frozen=True)
@@ -31,12 +35,14 @@ class Relief:
         west_m, south_m: world coordinates of the first cell's centre.
         cell_m: distance of cells.
         elevation_m: (rows from south, columns from west); 0 where no ground was scanned.
+        standing_m: the same of what stands on the ground or lies deep below it; 0 where there is only ground.
     """
 
     west_m: float
     south_m: float
     cell_m: float
     elevation_m: Floats
+    standing_m: Floats
 
     def at(self, xy_m: Floats) -> Floats:
         """Return elevations (N,) at world places (N, 2), bilinear; 0 beyond the raster."""
@@ -45,11 +51,35 @@ class Relief:
         places = np.nan_to_num(np.stack([row, column]), nan=-1e6)
         return np.asarray(map_coordinates(self.elevation_m, places, order=1, mode="constant", cval=0.0))
 
+    def shows_ground(self, rays: Floats, pose: Pose, origin_m: Floats, reach_m: float) -> Bools:
+        """Return which rays (N, 2) of a pose meet the ground, and nothing else within a horizontal distance.
+
+        Args:
+            pose: relative to `origin_m` (2,), the datum at z = 0.
+            reach_m: how far around each ray its feature reaches.
+        """
+        side = 2 * int(np.ceil(reach_m / self.cell_m)) + 1
+        top, bottom = maximum_filter(self.standing_m, side), -maximum_filter(-self.standing_m, side)
+        highest = min(float(top.max()), float(pose.centre_m[2]) - SIGHT_STEP_M)
+        shown = self._of_cell(bottom, intersect_height(pose.R, pose.centre_m, rays, 0.0) + origin_m) >= 0.0
+        for height in np.arange(RELIEF_REACH_M, highest + SIGHT_STEP_M, SIGHT_STEP_M):
+            places = intersect_height(pose.R, pose.centre_m, rays, height) + origin_m
+            shown &= self._of_cell(top, places) < height
+        return np.asarray(shown, dtype=np.bool_)
+
+    def _of_cell(self, raster: Floats, xy_m: Floats) -> Floats:
+        """Return the value (N,) of the cell in which each place (N, 2) lies; 0 beyond the raster."""
+        places = np.nan_to_num((xy_m - [self.west_m, self.south_m]) / self.cell_m, nan=-1e6)
+        column, row = np.rint(np.clip(places, -1e6, 1e6)).astype(np.int64).T
+        inside = (row >= 0) & (row < raster.shape[0]) & (column >= 0) & (column < raster.shape[1])
+        return np.where(inside, raster[np.where(inside, row, 0), np.where(inside, column, 0)], 0.0)
+
     def save(self, file: Path) -> None:
         """Write the raster for the next run."""
         stream = io.BytesIO()
         place = np.array([self.west_m, self.south_m, self.cell_m])
-        np.savez_compressed(stream, place=place, elevation_m=self.elevation_m.astype(np.float32))
+        rasters = {name: getattr(self, name).astype(np.float32) for name in ("elevation_m", "standing_m")}
+        np.savez_compressed(stream, place=place, **rasters)
         write_atomically(file, stream.getvalue())
 
     @staticmethod
@@ -58,7 +88,7 @@ class Relief:
         try:
             with np.load(file) as stored:
                 west, south, cell = (float(value) for value in stored["place"])
-                return Relief(west, south, cell, read_only(stored["elevation_m"]))
+                return Relief(west, south, cell, read_only(stored["elevation_m"]), read_only(stored["standing_m"]))
         except (OSError, ValueError, KeyError):
             return None
 
@@ -75,5 +105,24 @@ def rasterise(cloud: Cloud, plane: GroundPlane, extent_m: tuple[float, float, fl
     x, y = np.meshgrid(np.arange(west, east + cell, cell), np.arange(south, north + cell, cell))
     places = np.stack([x.ravel(), y.ravel()], axis=1)
     above_plane = np.nan_to_num(ground_elevation(cloud, plane, places))
-    elevation = plane.z_m(places) + above_plane - plane.z_m(at_m)
-    return Relief(west, south, cell, read_only(elevation.reshape(x.shape)))
+    datum = plane.z_m(places) - plane.z_m(at_m)
+    standing = _standing(cloud, plane, np.array([west, south]), cell, x.shape)
+    return Relief(
+        west,
+        south,
+        cell,
+        elevation_m=read_only((datum + above_plane).reshape(x.shape)),
+        standing_m=read_only(np.where(standing == 0.0, 0.0, datum.reshape(x.shape) + standing)),
+    )
+
+
+def _standing(cloud: Cloud, plane: GroundPlane, corner_m: Floats, cell_m: float, shape: tuple[int, ...]) -> Floats:
+    """Return the median height above the plane of each cell's points, 0 where they are ground or none."""
+    cells = np.rint((cloud.points_m[:, :2] + cloud.origin_m[:2] - corner_m) / cell_m).astype(np.int64)
+    inside = ((cells >= 0) & (cells < np.array(shape[::-1]))).all(axis=1)
+    number, height = cells[inside] @ [1, shape[1]], plane.height_of(cloud)[inside]
+    order = np.lexsort((height, number))
+    filled, first, count = np.unique(number[order], return_index=True, return_counts=True)
+    standing = np.zeros(shape)
+    standing.ravel()[filled] = height[order][first + count // 2]
+    return np.where(np.abs(standing) < RELIEF_REACH_M, 0.0, standing)

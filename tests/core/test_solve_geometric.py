@@ -9,11 +9,12 @@ import pytest
 
 from core.calibration import LAG
 from core.camera import fit_poses
-from core.coordinates import Floats
+from core.coordinates import Bools, Floats
 from core.ground_poses import fit_with_relief, solve_ground
 from core.lens import Lens
 from core.measurements import Recording
 from core.project import Project
+from core.relief import Relief
 from core.results import Status, TargetHistory
 from core.solution import Solution
 from core.solve_geometric import solve_geometric
@@ -110,6 +111,77 @@ def _equally_weighted_error(recording: Recording, centre_m: Floats, project: Pro
     rays = scene.LENS.rays_from_raw(recording.ground_raw)
     equal = fit_poses(rays, np.ones(rays.shape[:2]), ground.points_m, reference.pose, robust=False)
     return float(np.abs(equal.centre_m - centre_m).mean())
+
+
+# --- what stands on the ground ----------------------------------------------------------------------------------------
+
+CONTAINER_M = 2.6
+
+
+def on_containers() -> Bools:
+    """(N,) which ground features lie in the west of the site, where the recording below has containers."""
+    return np.asarray(scene.ground_places()[:, 0] < -15.0)
+
+
+def with_containers(noise_px: float, frames: int) -> Recording:
+    """The exact scene, but for features in the west that lie on containers where a person sees ground."""
+    height = np.where(on_containers(), CONTAINER_M, 0.0)
+    eye = scene.pose(0).centre_m
+    share = (height / eye[2])[:, None]
+    places = np.column_stack([(1 - share) * scene.ground_places() + share * eye[:2], height])
+    seen = np.array([scene.seen(frame, places) for frame in range(frames)])
+    noise = np.random.default_rng(8).normal(scale=noise_px, size=seen.shape)
+    noise[0] = 0.0
+    return replace(scene.recording(noise_px, frames), ground_raw=seen + noise)
+
+
+def test_what_no_cloud_shows_is_told_from_the_ground_by_how_it_moves() -> None:
+    recording = with_containers(0.02, scene.FRAMES)
+    assert 20 < on_containers().sum() < 0.3 * len(on_containers())
+    solution = solved(recording)
+    used = solution.ground.known_poses.weight.max(axis=0) > 0
+    assert not used[on_containers()].any()
+    assert used[~on_containers()].mean() > 0.95
+    without = recording.ground_raw.copy()
+    without[:, on_containers()] = np.nan
+    alone = solved(replace(recording, ground_raw=without))
+    assert rms_mm(solution.histories["roof"]) < 1.1 * rms_mm(alone.histories["roof"])
+
+
+def test_what_the_cloud_shows_is_no_ground_even_if_the_camera_hardly_moves() -> None:
+    recording = with_containers(0.3, 6)
+    cell = 0.5
+    west, south = scene.SITE_M - [30.0, 20.0]
+    x = west + cell * np.arange(120)
+    standing = np.broadcast_to(np.where(x < scene.SITE_M[0] - 13.0, CONTAINER_M, 0.0), (80, 120))
+    relief = Relief(float(west), float(south), cell, np.zeros((80, 120)), standing)
+    reference = fit_with_relief(scene.project_document(), scene.LENS, relief)
+    assert reference.pose is not None
+    shown = []
+    for known in (None, relief):
+        ground = solve_ground(recording, scene.LENS, reference.pose, reference.origin_m, known)
+        shown.append(ground.known_poses.weight.max(axis=0) > 0)
+    assert shown[0][on_containers()].all()
+    assert not shown[1][on_containers()].any()
+
+
+def test_a_camera_that_never_moves_tells_nothing_about_heights() -> None:
+    recording = scene.recording(0.0, 3)
+    still = replace(recording, ground_raw=np.repeat(recording.ground_raw[:1], 3, axis=0))
+    reference = fit_with_relief(scene.project_document(), scene.LENS, None)
+    assert reference.pose is not None
+    ground = solve_ground(still, scene.LENS, reference.pose, reference.origin_m, None)
+    assert (ground.known_poses.weight.max(axis=0) > 0).all()
+
+
+def test_a_cloud_in_which_everything_stands_is_not_believed() -> None:
+    recording = scene.recording(0.02, 6)
+    everywhere = np.full((200, 200), CONTAINER_M)
+    relief = Relief(*(scene.SITE_M - 50.0).tolist(), 0.5, np.zeros((200, 200)), everywhere)
+    reference = fit_with_relief(scene.project_document(), scene.LENS, None)
+    assert reference.pose is not None
+    ground = solve_ground(recording, scene.LENS, reference.pose, reference.origin_m, relief)
+    assert ground.usable.all()
 
 
 # --- frames whose ground is a repetition ------------------------------------------------------------------------------
