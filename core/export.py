@@ -267,6 +267,7 @@ def _ground_summary(ground: Ground) -> dict[str, Any]:
     usable = ground.usable
     return {
         "features": len(ground.points_m),
+        "features_left_out": int((~(ground.weight > 0).any(axis=0)).sum()),
         "frames": int(usable.sum()),
         "median_inliers": float(np.median(ground.inliers[usable])) if usable.any() else None,
         "least_inliers": int(ground.inliers[usable].min()) if usable.any() else None,
@@ -482,7 +483,8 @@ def _ground_facts(solution: Solution, ground: Mapping[str, Any]) -> list[Fact]:
         facts += [
             Fact(
                 "ground features in agreement",
-                f"median {ground['median_inliers']:.0f}, least {ground['least_inliers']}, of {ground['features']}",
+                f"median {ground['median_inliers']:.0f}, least {ground['least_inliers']}, of {ground['features']}; "
+                f"{ground['features_left_out']} of these left out throughout, as on things that stand on the ground",
             ),
             Fact("residual of a median frame", f"{ground['rms_px']:.3f} px RMS"),
         ]

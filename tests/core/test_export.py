@@ -125,6 +125,7 @@ def test_summary_says_what_the_contract_asks(written: tuple[Path, dict[str, Any]
     ground = stored["ground_fit"]
     assert ground["frames"] == scene.FRAMES
     assert ground["median_inliers"] == ground["least_inliers"] == ground["features"]
+    assert ground["features_left_out"] == 0
     assert ground["rms_px"] < 1e-3
     assert (stored["frames"], stored["seconds"], stored["frames_per_second"]) == (120, 6.0, 20.0)
     assert stored["version"] == "0.1.0"
