@@ -40,7 +40,8 @@ RELIEF_REACH_M = 0.35
 _RELIEF_RADII_M = (0.15, 0.3, 0.6)
 _RELIEF_MIN_POINTS = 6
 _RELIEF_MAX_POINTS = 200
-_PASS_POINTS = 2_000_000
+# Points looked at in one go.
+PASS_POINTS = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -525,8 +526,8 @@ def _near_places(points: Floats, places: Floats, radius_m: float) -> NDArray[np.
         for north in (-1, 0, 1):
             wanted[own[:, 0] + east, own[:, 1] + north] = True
     parts = []
-    for start in range(0, len(points), _PASS_POINTS):
-        cell = np.floor((points[start : start + _PASS_POINTS, :2] - low) / radius_m)
+    for start in range(0, len(points), PASS_POINTS):
+        cell = np.floor((points[start : start + PASS_POINTS, :2] - low) / radius_m)
         inside = np.flatnonzero(((cell >= 0) & (cell < size)).all(axis=1))
         cell = cell[inside].astype(np.int64)
         parts.append(start + inside[wanted[cell[:, 0], cell[:, 1]]])

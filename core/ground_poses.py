@@ -22,7 +22,7 @@ LEAST_GROUND = 20
 # No ground feature is believed to be steadier than this part of the usual one.
 LEAST_SCATTER = 0.3
 # A feature that lies further from the ground stands on it, if that is told by so many standard deviations.
-STANDING_M = 0.3
+STANDING_M = 0.5
 STANDING_SIGMA = 4.0
 STANDING_FRAMES = 150
 STANDING_ROUNDS = 4

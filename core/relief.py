@@ -16,8 +16,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates, maximum_filter
 
 from core.camera import Pose, intersect_height
-from core.cloud import RELIEF_REACH_M, Cloud, GroundPlane, ground_elevation
-from core.coordinates import Bools, Floats, read_only
+from core.cloud import PASS_POINTS, RELIEF_REACH_M, Cloud, GroundPlane, ground_elevation
+from core.coordinates import Bools, Floats, batches, read_only
 from core.project import write_atomically
 
 CELL_M = 0.25
@@ -117,12 +117,16 @@ def rasterise(cloud: Cloud, plane: GroundPlane, extent_m: tuple[float, float, fl
 
 
 def _standing(cloud: Cloud, plane: GroundPlane, corner_m: Floats, cell_m: float, shape: tuple[int, ...]) -> Floats:
-    """Return the median height above the plane of each cell's points, 0 where they are ground or none."""
-    cells = np.rint((cloud.points_m[:, :2] + cloud.origin_m[:2] - corner_m) / cell_m).astype(np.int64)
-    inside = ((cells >= 0) & (cells < np.array(shape[::-1]))).all(axis=1)
-    number, height = cells[inside] @ [1, shape[1]], plane.height_of(cloud)[inside]
-    order = np.lexsort((height, number))
-    filled, first, count = np.unique(number[order], return_index=True, return_counts=True)
-    standing = np.zeros(shape)
-    standing.ravel()[filled] = height[order][first + count // 2]
-    return np.where(np.abs(standing) < RELIEF_REACH_M, 0.0, standing)
+    """Return how high above the plane lies what most points of a cell show, 0 where that is ground, or nothing."""
+    points, high, height = (np.zeros(shape[0] * shape[1]) for _ in range(3))
+    total = len(cloud.points_m)
+    for batch in batches(total, PASS_POINTS):
+        some = cloud.select(np.arange(batch.start, min(batch.stop, total)))
+        cells = np.rint((some.points_m[:, :2] + some.origin_m[:2] - corner_m) / cell_m).astype(np.int64)
+        inside = ((cells >= 0) & (cells < np.array(shape[::-1]))).all(axis=1)
+        number, above = cells[inside] @ [1, shape[1]], plane.height_of(some)[inside]
+        stands = np.abs(above) >= RELIEF_REACH_M
+        points += np.bincount(number, minlength=len(points))
+        high += np.bincount(number[stands], minlength=len(points))
+        height += np.bincount(number[stands], above[stands], len(points))
+    return np.where(2 * high > points, height / np.maximum(high, 1), 0.0).reshape(shape)
