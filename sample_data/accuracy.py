@@ -68,7 +68,18 @@ LIMITS: Mapping[str, Limit] = {
     "gust": DISTURBED,
 }
 NO_LIMIT = Limit(None)
-USUAL_SCENES = (*LIMITS, "mid_shaking", "fps60", "fps120", "portrait", "points_roof", "two_targets", "rolling_shutter")
+USUAL_SCENES = (
+    *LIMITS,
+    "mid_shaking",
+    "fps60",
+    "fps120",
+    "portrait",
+    "points_roof",
+    "two_targets",
+    "rolling_shutter",
+    "dusk",
+    "variable_rate",
+)
 PAPER_SCENES = ("eq5_slow_drift", "eq7_slow_drift")
 
 
