@@ -6,9 +6,11 @@ Whoever looks at a frame looks next at the one after it, or before it: both are 
 from __future__ import annotations
 
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,9 +23,10 @@ from numpy.typing import NDArray
 from app.seeking import SeekingReader
 from core.errors import InputError
 from core.lens import Lens
+from core.storage import FarFile, File, FileState, file_at, state_of
 
 Picture = NDArray[np.uint8]
-Fingerprint = tuple[str, int, int]
+Fingerprint = tuple[str, int, int | str]
 
 JPEG_QUALITY = 90
 # As decoded, a frame of 4K takes 12 MB: enough for a group of pictures and those fetched before and after.
@@ -31,6 +34,8 @@ _DECODED_BYTES = 448 << 20
 _PICTURE_BYTES = 80 << 20
 _JPEG_BYTES = 96 << 20
 _OPEN_VIDEOS = 3
+# A file that lies far away is looked at again after so many seconds.
+_ASKED_AGAIN_S = 30.0
 _AHEAD = 3
 _BEHIND = 6
 
@@ -75,7 +80,7 @@ class FrameStore:
         self._wanted: tuple[Fingerprint, int] | None = None
         self._undistorting: tuple[Any, tuple[Picture, Picture]] | None = None
 
-    def frame(self, video: Path, number: int) -> Picture:
+    def frame(self, video: File, number: int) -> Picture:
         """Return a frame, (height, width, 3) RGB upright.
 
         Raises:
@@ -88,7 +93,7 @@ class FrameStore:
             self._pictures.put(key, found)
         return cast(Picture, found)
 
-    def jpeg(self, video: Path, number: int, *, width: int | None = None, lens: Lens | None = None) -> bytes:
+    def jpeg(self, video: File, number: int, *, width: int | None = None, lens: Lens | None = None) -> bytes:
         """Return a frame as JPEG, undistorted where a lens is given, scaled down to `width` where that is smaller.
 
         Raises:
@@ -116,7 +121,7 @@ class FrameStore:
         for video in videos:
             video.close()
 
-    def _video(self, file: Path) -> _Video:
+    def _video(self, file: File) -> _Video:
         key = fingerprint(file)
         with self._lock:
             video = self._videos.pop(key, None) or _Video(file, key, self._decoded)
@@ -126,7 +131,7 @@ class FrameStore:
             forgotten.close()
         return video
 
-    def _prepare(self, file: Path, number: int) -> None:
+    def _prepare(self, file: File, number: int) -> None:
         """Decode what is likely to be asked for next; stops when something else is."""
         video = self._video(file)
         for following in range(number + 1, min(number + 1 + _AHEAD, len(video.onwards.index))):
@@ -151,7 +156,7 @@ class FrameStore:
 class _Video:
     """A video opened twice: where a person looks, and where the frames before are fetched from meanwhile."""
 
-    def __init__(self, file: Path, key: Fingerprint, decoded: ByteCache) -> None:
+    def __init__(self, file: File, key: Fingerprint, decoded: ByteCache) -> None:
         self.key, self._decoded = key, decoded
         self.onwards, self.backwards = (SeekingReader(file, self._kept, self._keep) for _ in range(2))
 
@@ -182,17 +187,31 @@ def _upright(frame: VideoFrame) -> Picture:
     return cast(Picture, picture)
 
 
-def fingerprint(file: Path) -> Fingerprint:
-    """Return what changes with a file's content.
+def fingerprint(file: File) -> Fingerprint:
+    """Return what changes with a file's content; see `file_of`.
 
     Raises:
         InputError: it is not there.
     """
+    if isinstance(file, FarFile):
+        far = _far_state(file, int(time.monotonic() / _ASKED_AGAIN_S))
+        return str(file), far.size, far.version
     try:
         state = file.stat()
     except OSError:
         raise InputError(f"{file}: not found; choose it again in the inputs.") from None
     return str(file), state.st_size, state.st_mtime_ns
+
+
+@lru_cache(maxsize=32)
+def _far_state(file: FarFile, moment: int) -> FileState:
+    """Return the state of a file that lies far away; asked for only once a moment, since every page needs it."""
+    return state_of(file)
+
+
+def file_of(key: Fingerprint) -> File:
+    """Return the file a fingerprint was taken of."""
+    return file_at(Path(), key[0])
 
 
 def scaled_to(picture: Picture, width: int | None) -> Picture:

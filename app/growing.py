@@ -77,9 +77,7 @@ def _look(here: Context, folder: ProjectFolder, inputs: LoadedInputs, growth: _G
     if not file.is_file():
         return
     with MeasurementStore(file) as store:
-        number = store.find(
-            inputs.project.method, wanted_fingerprint(inputs.folder / inputs.project.inputs.video, inputs.project)
-        )
+        number = store.find(inputs.project.method, wanted_fingerprint(inputs.video, inputs.project))
         if number is None:
             return
         recording = store.load(number, after=growth.last_frame)

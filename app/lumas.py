@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import threading
 from functools import lru_cache
-from pathlib import Path
 
-from app.frames import Fingerprint
+from app.frames import Fingerprint, file_of
 from core.errors import InputError
 from core.video import Luma, read_frame
 
@@ -37,4 +36,4 @@ def prepare_luma(video: Fingerprint, number: int) -> None:
 
 @lru_cache(maxsize=3)
 def _luma_of(video: Fingerprint, number: int) -> Luma:
-    return read_frame(Path(video[0]), number).luma
+    return read_frame(file_of(video), number).luma

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from app.errors import ApiError, NotYet
-from app.frames import Fingerprint, fingerprint
+from app.frames import Fingerprint, file_of, fingerprint
 from app.jobs import JOB_FILE
 from app.store import ProjectFolder, read_json, stored_inputs
 from app.videos import video_info
@@ -31,6 +31,7 @@ from core.results import TargetHistory, read_history_csv
 from core.run import FRAMES_FILE, LoadedInputs, load_inputs, program_version, relief_plan
 from core.solution import Solution
 from core.solve import solve
+from core.storage import File, file_at
 from core.video import frame_index
 
 METHODS: tuple[Method, ...] = ("geometric", "paper")
@@ -113,7 +114,8 @@ def _is_stale(folder: ProjectFolder, project: Project, summary: dict[str, Any]) 
     made_s = (folder.results / SUMMARY_FILE).stat().st_mtime
     for file in stored_inputs(project.inputs).values():
         try:
-            if file is not None and (folder.folder / file).stat().st_mtime > made_s:
+            near = None if file is None else file_at(folder.folder, file)
+            if isinstance(near, Path) and near.stat().st_mtime > made_s:
                 return True
         except OSError:
             return True
@@ -123,7 +125,7 @@ def _is_stale(folder: ProjectFolder, project: Project, summary: dict[str, Any]) 
 def _frames_total(folder: ProjectFolder, project: Project, exactly: bool) -> int:
     """Return how many frames the video has; what the container says suffices before any is measured."""
     try:
-        video = folder.require_input("video", project)
+        video = folder.require_video(project)
         return len(frame_index(video)) if exactly else video_info(video).frames or 0
     except (InputError, ApiError):
         return 0
@@ -133,7 +135,7 @@ def recorded_of(folder: ProjectFolder, project: Project, method: Method) -> Reco
     """Return how much has been measured by a method of what the project wants now."""
     file = folder.results / FRAMES_FILE
     try:
-        video = folder.require_input("video", project)
+        video = folder.require_video(project)
         wanted = _wanted(fingerprint(video), project.model_copy(update={"method": method}))
         if not file.is_file():
             return Recorded()
@@ -146,13 +148,13 @@ def recorded_of(folder: ProjectFolder, project: Project, method: Method) -> Reco
         return Recorded()
 
 
-def wanted_fingerprint(video: Path, project: Project) -> str:
+def wanted_fingerprint(video: File, project: Project) -> str:
     """Return the engine's name for what a project wants measured of its video.
 
     Raises:
         InputError: the video is not there.
     """
-    return _wanted(fingerprint(video.resolve()), project)
+    return _wanted(fingerprint(video.resolve() if isinstance(video, Path) else video), project)
 
 
 def _wanted(video: Fingerprint, project: Project) -> str:
@@ -178,7 +180,7 @@ def _wanted_fingerprint(video: Fingerprint, decided: str, hidden: _Hidden) -> st
     """Return the engine's name for what is to be measured; the geometry, left out here, takes no part in it."""
     project = hidden.project
     setup = MeasureSetup(
-        video=Path(video[0]),
+        video=file_of(video),
         reference_frame=project.reference_frame,
         moving_regions_px=project.moving_regions_px,
         targets=project.targets,
@@ -281,7 +283,7 @@ class Outcomes:
 def _solve(folder: ProjectFolder, project: Project, method: Method) -> Solved:
     inputs = loaded(folder, project)
     inputs = replace(inputs, project=by_method(project, method))
-    wanted = _wanted(fingerprint(folder.require_input("video", project)), inputs.project)
+    wanted = _wanted(fingerprint(folder.require_video(project)), inputs.project)
     with MeasurementStore(folder.results / FRAMES_FILE) as store:
         number = store.find(method, wanted)
         if number is None:
@@ -349,7 +351,7 @@ def _stamps(folder: ProjectFolder, project: Project) -> tuple[Any, ...]:
     stamps: list[Any] = []
     for kind in ("video", "cloud", "lens", "gps"):
         try:
-            path = folder.input_path(kind, project)
+            path = folder.input_file(kind, project)
             stamps.append(None if path is None else fingerprint(path))
         except (InputError, ApiError):
             stamps.append(None)

@@ -32,7 +32,7 @@ def lens_of(folder: ProjectFolder, project: Project) -> tuple[Lens, bool]:
     Raises:
         InputError: the lens file cannot be used, or is another camera's.
     """
-    video = folder.require_input("video", project)
+    video = folder.require_video(project)
     info = video_info(video)
     size = {"width": info.width, "height": info.height}
     if project.inputs.lens is None:

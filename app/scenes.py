@@ -148,7 +148,7 @@ def _show_flight(
     above = np.array([0.0, 0.0, _ground_z_m(folder, project, site)])
     place = None if solved is None else _place_of(solved, frame)
     pose, path = _pose_and_path(fit, solved, place)
-    video = fingerprint(folder.require_input("video", project))
+    video = fingerprint(folder.require_video(project))
     key = (video, frame, pose.centre_m.tobytes(), pose.R.tobytes(), None if path is None else path.tobytes())
     if not here.scene.has("camera", key):
         moved = Pose(pose.R, pose.centre_m + above)
@@ -208,7 +208,7 @@ def _show_lines(here: Context, solved: Solved, place: int, exaggeration: float, 
 def _camera(
     here: Context, folder: ProjectFolder, project: Project, frame: int, fit: ReferenceFit, pose: Pose
 ) -> CameraView:
-    picture = scaled_to(here.frames.frame(folder.require_input("video", project), frame), _PICTURE_WIDTH)
+    picture = scaled_to(here.frames.frame(folder.require_video(project), frame), _PICTURE_WIDTH)
     width, height = fit.lens.image_size_px
     return CameraView(
         R=pose.R,

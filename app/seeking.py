@@ -9,8 +9,8 @@ from __future__ import annotations
 import bisect
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import cached_property
-from pathlib import Path
 
 import av
 from av.container import InputContainer
@@ -18,7 +18,8 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from core.errors import InputError
-from core.video import FrameIndex, frame_index, probe
+from core.storage import File
+from core.video import FrameIndex, frame_index, opened_video
 
 # Decoding on over so many frames is quicker than seeking to a key frame, which empties the decoder's threads.
 _READ_ON = 8
@@ -28,11 +29,12 @@ class SeekingReader:
     """One video, open where it was read last."""
 
     def __init__(
-        self, video: Path, kept: Callable[[int], VideoFrame | None], keep: Callable[[int, VideoFrame], None]
+        self, video: File, kept: Callable[[int], VideoFrame | None], keep: Callable[[int, VideoFrame], None]
     ) -> None:
         """Read a video; `kept` and `keep` fetch and store decoded frames by number, wherever that is done."""
         self._video, self._kept, self._keep = video, kept, keep
-        self._container: InputContainer | None = None
+        self._opened_now: tuple[InputContainer, VideoStream] | None = None
+        self._closing = ExitStack()
         self._pictures: Iterator[VideoFrame] | None = None
         self._first = self._next = 0
         self._lock = threading.Lock()
@@ -121,18 +123,11 @@ class SeekingReader:
         self._next = self._first
 
     def _opened(self) -> tuple[InputContainer, VideoStream]:
-        if self._container is None:
-            try:
-                self._container = av.open(str(self._video))
-                self._container.streams.video[0].codec_context.thread_type = "AUTO"
-            except (av.error.FFmpegError, OSError, ValueError, IndexError):
-                self._close()
-                probe(self._video)  # says in a sentence what is wrong
-                raise
-        return self._container, self._container.streams.video[0]
+        if self._opened_now is None:
+            self._opened_now = self._closing.enter_context(opened_video(self._video))
+            self._opened_now[1].codec_context.thread_type = "AUTO"
+        return self._opened_now
 
     def _close(self) -> None:
-        self._pictures = None
-        if self._container is not None:
-            self._container.close()
-            self._container = None
+        self._pictures = self._opened_now = None
+        self._closing.close()

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app import orthoimages, outcome
@@ -80,7 +81,7 @@ def steps_of(here: Context, folder: ProjectFolder, project: Project, *, look: bo
 def _is_read_through(seen: _Look) -> bool:
     """Whether looking for problems takes no longer than a page may; a large video is read through meanwhile."""
     try:
-        video = seen.folder.require_input("video", seen.project)
+        video = seen.folder.require_video(seen.project)
         return is_read_through(seen.here.hub, seen.folder, video)
     except (InputError, ApiError):
         return True
@@ -101,10 +102,10 @@ def _inputs(seen: _Look) -> Step:
         if file is None:
             continue
         try:
-            path = seen.folder.input_path(kind, seen.project)
+            path = seen.folder.input_file(kind, seen.project)
         except ApiError as error:
             return _step("error", error.message)
-        if path is None or not path.is_file():
+        if path is None or (isinstance(path, Path) and not path.is_file()):
             missing.append(kind)
         else:
             given.append(kind)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from app.errors import ApiError, Conflict, Invalid, Missing
+from app.errors import ApiError, Conflict, Invalid, Missing, Refused
 from app.history import HISTORY_FILE, Entry, Head, History
 from app.places import Places
 from core.errors import InputError
@@ -29,6 +29,7 @@ from core.project import (
     project_problems,
     write_project,
 )
+from core.storage import File, file_at
 
 RESULTS_FOLDER = "results"
 CACHE_FOLDER = "cache"
@@ -131,17 +132,42 @@ class ProjectFolder:
         """Return what changes whenever `project.json` or the results are written, whoever does it."""
         return _modified_ns(self.folder / PROJECT_FILE), _modified_ns(self.results / "summary.json")
 
-    def input_path(self, kind: str, project: Project | None = None) -> Path | None:
-        """Return where an input lies, or None where none is given.
+    def input_file(self, kind: str, project: Project | None = None) -> File | None:
+        """Return where an input lies, on this computer or, of a video, perhaps far away; None where none is given.
 
         Raises:
             Refused: outside the allowed folders.
         """
         stored = stored_inputs((project or self.load().project).inputs)[kind]
-        return None if stored is None else self._places.allowed(os.path.abspath(self.folder / stored))
+        if stored is None:
+            return None
+        file = file_at(self.folder, stored) if kind == "video" else self.folder / stored
+        if isinstance(file, Path):
+            return self._places.allowed(os.path.abspath(file))
+        if file.is_near:
+            raise Refused(f"{file}: is a file of this computer; name it by its path.", path=f"inputs.{kind}")
+        return file
+
+    def input_path(self, kind: str, project: Project | None = None) -> Path | None:
+        """Return where an input lies on this computer, or None where none is given there.
+
+        Raises:
+            Refused: outside the allowed folders.
+        """
+        file = self.input_file(kind, project)
+        return file if isinstance(file, Path) else None
+
+    def require_video(self, project: Project | None = None) -> File:
+        """Return where the video lies.
+
+        Raises:
+            Missing: none is given, or it is not there.
+        """
+        file = self.input_file("video", project)
+        return self.require_input("video", project) if file is None or isinstance(file, Path) else file
 
     def require_input(self, kind: str, project: Project | None = None) -> Path:
-        """Return where an input lies.
+        """Return where an input lies on this computer.
 
         Raises:
             Missing: none is given, or it is not there.

@@ -9,12 +9,12 @@ from __future__ import annotations
 import contextlib
 import threading
 from functools import lru_cache
-from pathlib import Path
 
 from app.events import Hub
-from app.frames import Fingerprint, fingerprint
+from app.frames import Fingerprint, file_of, fingerprint
 from app.store import ProjectFolder
 from core.errors import InputError
+from core.storage import File
 from core.video import VideoInfo, frame_index, probe
 
 # A file up to this size is read through in less time than a person notices.
@@ -24,7 +24,7 @@ _being_read: set[Fingerprint] = set()
 _lock = threading.Lock()
 
 
-def video_info(path: Path) -> VideoInfo:
+def video_info(path: File) -> VideoInfo:
     """Return what the video's container says, kept while the file stays.
 
     Raises:
@@ -35,10 +35,10 @@ def video_info(path: Path) -> VideoInfo:
 
 @lru_cache(maxsize=32)
 def _probed(key: Fingerprint) -> VideoInfo:
-    return probe(Path(key[0]))
+    return probe(file_of(key))
 
 
-def is_read_through(hub: Hub, folder: ProjectFolder, path: Path) -> bool:
+def is_read_through(hub: Hub, folder: ProjectFolder, path: File) -> bool:
     """Whether it is known where every frame lies; if not, have it read and tell the project's tabs afterwards.
 
     Raises:

@@ -48,6 +48,11 @@ class FarFile:
         """What comes last in the address."""
         return self.address.rstrip("/").rpartition("/")[2]
 
+    @property
+    def is_near(self) -> bool:
+        """Whether the address leads to this machine's own files after all."""
+        return urlsplit(self.address.rpartition("::")[2]).scheme in ("file", "local")
+
 
 File = Path | FarFile
 

@@ -95,7 +95,12 @@ class FrameIndex:
 
 
 @contextmanager
-def _opened(path: File) -> Iterator[tuple[InputContainer, VideoStream]]:
+def opened_video(path: File) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """Open a video and its first stream of pictures.
+
+    Raises:
+        InputError: as `probe`, but for what only decoding tells.
+    """
     with ExitStack() as stack:
         # FFmpeg opens what lies on this machine itself.
         source = str(path) if isinstance(path, Path) else stack.enter_context(opened(path))
@@ -124,7 +129,7 @@ def probe(path: File) -> VideoInfo:
     Raises:
         InputError: no such file, no container, no video stream, or no frame that can be decoded.
     """
-    with _opened(path) as (container, stream):
+    with opened_video(path) as (container, stream):
         try:
             frame = next(container.decode(stream))
         except (StopIteration, av.error.FFmpegError):
@@ -167,7 +172,7 @@ def frame_index(path: File) -> FrameIndex:
 def _frame_index(path: File, state: FileState) -> FrameIndex:
     ticks: list[int] = []
     keys: list[int] = []
-    with _opened(path) as (container, stream):
+    with opened_video(path) as (container, stream):
         try:
             for packet in container.demux(stream):
                 if packet.pts is None or packet.is_discard:
@@ -333,7 +338,7 @@ def _pictures(
     path: File, start: int, stop: int | None, threads: int, index: FrameIndex | None
 ) -> Iterator[tuple[VideoFrame, int]]:
     """Yield decoded pictures with their frame numbers; numbers after a seek come from the timestamps alone."""
-    with _opened(path) as (container, stream):
+    with opened_video(path) as (container, stream):
         stream.codec_context.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
         position = _seek(container, stream, path, start, index) if start > 0 else None

@@ -22,7 +22,7 @@ def frame(
 ) -> Response:
     """Return a frame as JPEG: raw, or undistorted; `w` scales it down."""
     project = folder.load().project
-    video = folder.require_input("video", project)
+    video = folder.require_video(project)
     lens = lens_of(folder, project)[0] if und else None
     picture = here.frames.jpeg(video, number, width=w, lens=lens)
     return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=60"})

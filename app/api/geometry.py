@@ -198,7 +198,7 @@ def preview(wanted: Drawn, folder: Folder, here: Here) -> dict[str, Any]:
     """Return the edges, lines and points the engine finds in a target's bands in the reference frame."""
     project = folder.load().project
     found = _fit_for_points(here, folder, project)
-    luma = luma_of(fingerprint(folder.require_input("video", project)), project.reference_frame)
+    luma = luma_of(fingerprint(folder.require_video(project)), project.reference_frame)
     lines = wanted.target.get("lines")
     if isinstance(lines, dict) and 0 < sum(lines.get(name) is not None for name in LINE_NAMES) < len(LINE_NAMES):
         bands = {name: _valid(Band, lines[name], f"lines.{name}") for name in LINE_NAMES if lines.get(name)}

@@ -15,6 +15,7 @@ from app.api.projects import Body
 from app.calibrations import REPORT_FILE, board_of
 from app.context import Context, Folder, Here, tell_saved
 from app.errors import ApiError, Invalid, Missing
+from app.frames import fingerprint
 from app.jobs import Finish
 from app.places import SUFFIXES_OF_CLOUD_TABLES, kind_of
 from app.store import CHECKERBOARD_FOLDER, INPUT_KINDS, ProjectFolder, problem_of, read_json, stored_inputs
@@ -23,6 +24,7 @@ from app.videos import is_read_through, video_info
 from core.errors import InputError
 from core.lens import read_lens, require_image_size
 from core.project import Project
+from core.storage import FarFile, File
 from core.validation import read_gps
 from core.video import frame_index
 
@@ -107,8 +109,10 @@ def _understood(here: Context, folder: ProjectFolder, project: Project, kind: st
     file = stored_inputs(project.inputs)[kind]
     if file is None:
         return None
-    readers = {"video": _video, "cloud": _cloud, "lens": _lens, "gps": _gps}
+    readers = {"cloud": _cloud, "lens": _lens, "gps": _gps}
     try:
+        if kind == "video":
+            return _video(here, folder, file, folder.require_video(project))
         path = folder.require_input(kind, project)
         return {"file": file, "path": str(path), "size": path.stat().st_size} | readers[kind](
             here, folder, project, path
@@ -117,13 +121,21 @@ def _understood(here: Context, folder: ProjectFolder, project: Project, kind: st
         return {"file": file, "error": {"message": problem_of(error)}}
 
 
-def _video(here: Context, folder: ProjectFolder, project: Project, path: Path) -> dict[str, Any]:
-    info = video_info(path)
-    facts = {"width": info.width, "height": info.height, "codec": info.codec, "rotation_deg": info.rotation_deg}
-    if not is_read_through(here.hub, folder, path):
+def _video(here: Context, folder: ProjectFolder, named: str, video: File) -> dict[str, Any]:
+    info = video_info(video)
+    facts = {
+        "file": named,
+        "path": str(video),
+        "size": fingerprint(video)[1],
+        "width": info.width,
+        "height": info.height,
+        "codec": info.codec,
+        "rotation_deg": info.rotation_deg,
+    }
+    if not is_read_through(here.hub, folder, video):
         told = {"rate_hz": info.rate_hz, "frames": info.frames, "duration_s": info.duration_s}
         return facts | told | {"variable_rate": None}
-    index = frame_index(path)
+    index = frame_index(video)
     steps_s = index.time_s[1:] - index.time_s[:-1]
     varies = len(steps_s) > 0 and bool(abs(steps_s - steps_s.mean()).max() > 0.1 * steps_s.mean())
     return facts | {
@@ -140,8 +152,8 @@ def _cloud(here: Context, folder: ProjectFolder, project: Project, path: Path) -
 
 def _lens(here: Context, folder: ProjectFolder, project: Project, path: Path) -> dict[str, Any]:
     lens = read_lens(path)
-    video = folder.input_path("video", project)
-    if video is not None and video.is_file():
+    video = folder.input_file("video", project)
+    if isinstance(video, FarFile) or (video is not None and video.is_file()):
         info = video_info(video)
         require_image_size(lens, width=info.width, height=info.height, lens_file=path.name, video_file=video.name)
     return {

@@ -77,7 +77,7 @@ def rectified(folder: Folder, here: Here, pixels: Pixels = _PIXELS) -> dict[str,
         fit = reference_fit(here, folder, project)
     except (InputError, ApiError) as error:
         return {"ready": False, "message": problem_of(error), "grid": None}
-    prepare_luma(fingerprint(folder.require_input("video", project)), project.reference_frame)
+    prepare_luma(fingerprint(folder.require_video(project)), project.reference_frame)
     return {"ready": True, "message": "", "grid": vars(coarser(plan_grid(folder, project, fit), pixels))}
 
 
@@ -90,7 +90,7 @@ def rectified_picture(folder: Folder, here: Here, pixels: Pixels = _PIXELS) -> R
     except InputError as error:
         raise NotYet(str(error), path="correspondences") from None
     grid = coarser(plan_grid(folder, project, fit), pixels)
-    frame = here.frames.frame(folder.require_input("video", project), project.reference_frame)
+    frame = here.frames.frame(folder.require_video(project), project.reference_frame)
     return _cacheable(_rectified(_Rectified(frame, fit, grid)), "image/jpeg")
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import fsspec
 import numpy as np
 import pytest
 import uvicorn
@@ -244,3 +245,42 @@ def test_pictures_of_a_calibration_from_this_computer_are_shown_too(client: Test
     assert answer.headers["content-type"] == "image/png"
     assert np.array_equal(cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR), picture)
     assert client.get(f"{SMALL}/lens/images/hostname.png").status_code == 403
+
+
+# --- videos that lie far away ----------------------------------------------------------------------------------------
+
+
+def name_video(workspace: Path, address: str) -> None:
+    file = workspace / "small" / "project.json"
+    document = json.loads(file.read_text("utf-8"))
+    document["inputs"]["video"] = address
+    file.write_text(json.dumps(document), "utf-8")
+
+
+def test_a_video_far_away_is_shown_as_one_that_lies_here(client: TestClient, workspace: Path) -> None:
+    here = client.get(f"{SMALL}/inputs").json()["video"]
+    pictures = [client.get(f"{SMALL}/frames/{number}.jpg").content for number in (0, 31)]
+    assert all(picture.startswith(b"\xff\xd8") for picture in pictures)
+    address = "memory://campaign/small.mp4"
+    fsspec.filesystem("memory").pipe("/campaign/small.mp4", (workspace / "small" / here["file"]).read_bytes())
+    name_video(workspace, address)
+    far = client.get(f"{SMALL}/inputs").json()["video"]
+    assert far == {**here, "file": address, "path": address}
+    assert client.get(SMALL).json()["steps"]["inputs"]["status"] == "done"
+    assert [client.get(f"{SMALL}/frames/{number}.jpg").content for number in (0, 31)] == pictures
+
+
+def test_a_video_that_is_not_there_any_more_is_said_so(client: TestClient, workspace: Path) -> None:
+    name_video(workspace, "memory://campaign/gone.mp4")
+    answer = client.get(f"{SMALL}/frames/0.jpg")
+    assert answer.status_code == 422
+    assert "memory://campaign/gone.mp4: not found" in answer.json()["error"]["message"]
+    assert "not found" in client.get(f"{SMALL}/inputs").json()["video"]["error"]["message"]
+
+
+@pytest.mark.parametrize("address", ["file:///etc/hostname", "filecache::local:///etc/hostname"])
+def test_an_address_leads_to_no_file_of_this_computer(client: TestClient, workspace: Path, address: str) -> None:
+    name_video(workspace, address)
+    answer = client.get(f"{SMALL}/frames/0.jpg")
+    assert answer.status_code == 403
+    assert "name it by its path" in answer.json()["error"]["message"]
