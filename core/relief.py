@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from scipy.ndimage import map_coordinates, maximum_filter
@@ -86,10 +87,10 @@ class Relief:
     def load(file: Path) -> Relief | None:
         """Return an earlier raster, or None where there is none that can be read."""
         try:
-            with np.load(file) as stored:
+            with file.open("rb") as stream, np.load(stream) as stored:
                 west, south, cell = (float(value) for value in stored["place"])
                 return Relief(west, south, cell, read_only(stored["elevation_m"]), read_only(stored["standing_m"]))
-        except (OSError, ValueError, KeyError):
+        except (OSError, ValueError, KeyError, BadZipFile):
             return None
 
 

@@ -36,6 +36,8 @@ from core.video import VideoInfo, frame_index, probe
 
 FRAMES_FILE = "frames.sqlite"
 RELIEF_FILE = "relief.npz"
+# Counts up when a relief keeps something else, so that none of an earlier version is taken for it.
+RELIEF_VERSION = 2
 ORTHOIMAGE_FILE = "orthoimage.tif"
 # How far around the clicks the relief of the ground is kept, metres.
 RELIEF_MARGIN_M = 15.0
@@ -219,7 +221,9 @@ def relief_plan(folder: Path, project: Project) -> ReliefPlan | None:
     east, north = np.ceil(places.max(axis=0) + RELIEF_MARGIN_M)
     below = _middle_of_targets(project, places)
     extent = (float(west), float(south), float(east), float(north))
-    decided = json.dumps([video_identity(cloud_file), extent, below.tolist(), project.orthoimage.ground_z_m])
+    decided = json.dumps(
+        [RELIEF_VERSION, video_identity(cloud_file), extent, below.tolist(), project.orthoimage.ground_z_m]
+    )
     name = hashlib.sha256(decided.encode()).hexdigest()[:16]
     return ReliefPlan(extent, below, folder / "results" / f"{name}-{RELIEF_FILE}")
 
