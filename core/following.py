@@ -35,6 +35,8 @@ NEIGHBOURS_M = 1.4
 LINE_SEARCH_M = 0.14
 # Every so many frames the whole picture confirms that no neighbouring strip has been taken.
 CONFIRM_EVERY = 15
+# Another place than where strips were found must show this part of them at least.
+AS_WELL = 0.8
 POINTS = 160
 
 
@@ -74,6 +76,11 @@ class TargetMatch:
 
     raw: Floats
     apparent: Apparent | None
+
+    @property
+    def measured(self) -> int:
+        """Number of coordinates that were measured."""
+        return int(np.isfinite(self.raw).sum())
 
 
 class Follower(Protocol):
@@ -153,7 +160,11 @@ class LinesFollower:
         if seen is None:
             return found or TargetMatch(np.full_like(self.reference_raw, np.nan), None)
         rotation = predicted.rotation_rad if predicted is not None else 0.0
-        return self._measure(luma, H_ray_ray0, Apparent(seen, rotation))
+        there = self._measure(luma, H_ray_ray0, Apparent(seen, rotation))
+        if found is not None and found.apparent is not None and there.measured < AS_WELL * found.measured:
+            # The picture is mistaken: something else that looks alike lies there.
+            return found
+        return there
 
     def _may_be_kept(self, luma: Luma, H_ray_ray0: Floats, apparent: Apparent | None, confirm: bool) -> bool:
         return apparent is not None and (not confirm or self._finder.agrees(luma, H_ray_ray0, apparent))

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from core.coordinates import Floats
+from core.following import Apparent, LinesFollower, Scale
+from core.lens import Lens
+from core.video import Luma
+from tests.waves import frame, pixels, waves
+
+SIZE = (480, 360)
+FOCAL_PX = 500.0
+PX_PER_M = 25.0
+LENS = Lens.ideal(SIZE, FOCAL_PX)
+# L1 and L2 are the upper two of three equal strips, 1.2 m apart; T1 crosses them.
+ROWS, COLUMN = (150.0, 180.0, 210.0), 250.0
+BANDS = np.array([[[150, ROWS[0]], [350, ROWS[0]]], [[150, ROWS[1]], [350, ROWS[1]]], [[COLUMN, 100], [COLUMN, 260]]])
+NEIGHBOUR = Apparent(np.array([0.0, (ROWS[1] - ROWS[0]) / FOCAL_PX]), 0.0)
+
+
+@lru_cache
+def roof() -> Luma:
+    """Strips on a roof with some texture, which alone tells one strip from the next."""
+    place = pixels(SIZE)
+    across = np.minimum.reduce([np.abs(place[..., 1] - row) for row in ROWS] + [np.abs(place[..., 0] - COLUMN)])
+    return frame(0.5 * waves(6)(place) + 110.0 / (1.0 + np.exp((across - 3.0) / 0.5)))
+
+
+def follower() -> LinesFollower:
+    ends = LENS.rays_from_raw(BANDS.astype(float))
+    scale = Scale(rays_per_m=PX_PER_M / FOCAL_PX, pixels_per_m=PX_PER_M)
+    return LinesFollower(roof(), ends, LENS, widths_px=[14.0] * 3, scale=scale, names=["L1", "L2", "T1"])
+
+
+def shift_px(apparent: Apparent | None) -> Floats:
+    assert apparent is not None
+    return apparent.shift * FOCAL_PX
+
+
+def test_a_neighbouring_strip_is_taken_until_the_whole_picture_is_looked_at() -> None:
+    unaware = follower().find(roof(), np.eye(3), NEIGHBOUR, confirm=False)
+    np.testing.assert_allclose(shift_px(unaware.apparent), [0.0, 30.0], atol=0.5)
+    confirmed = follower().find(roof(), np.eye(3), NEIGHBOUR, confirm=True)
+    np.testing.assert_allclose(shift_px(confirmed.apparent), [0.0, 0.0], atol=0.5)
+
+
+def test_a_mistaken_picture_does_not_cost_lines_that_are_seen_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    mistaken = follower()
+    monkeypatch.setattr(mistaken._finder, "_likest", lambda *where: np.array([35.0, 4.0]) / FOCAL_PX)
+    seen = mistaken.find(roof(), np.eye(3), Apparent.none(), confirm=False)
+    kept = mistaken.find(roof(), np.eye(3), Apparent.none(), confirm=True)
+    np.testing.assert_array_equal(kept.raw, seen.raw)
+    np.testing.assert_allclose(shift_px(kept.apparent), [0.0, 0.0], atol=0.5)
+
+
+def test_without_a_prediction_the_whole_picture_says_where_the_lines_are() -> None:
+    moved = np.roll(roof(), (12, -20), axis=(0, 1))
+    found = follower().find(moved, np.eye(3), None, confirm=False)
+    np.testing.assert_allclose(shift_px(found.apparent), [-20.0, 12.0], atol=0.5)
