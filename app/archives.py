@@ -53,8 +53,8 @@ def archive_stream(project: ProjectFolder, *, inputs: bool) -> Iterator[bytes]:
 def _outside_inputs(project: ProjectFolder, stored: Project) -> dict[str, Path]:
     found = {}
     for kind, file in stored_inputs(stored.inputs).items():
-        path = project.input_file(kind, stored) if file is not None else None
-        if isinstance(path, Path) and path.is_file() and project.folder.resolve() not in path.parents:
+        path = project.input_path(kind, stored) if file is not None else None
+        if path is not None and path.is_file() and project.folder.resolve() not in path.parents:
             found[kind] = path
     return found
 

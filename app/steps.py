@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app import orthoimages, outcome
@@ -97,18 +96,15 @@ def _step(status: str, message: str) -> Step:
 
 
 def _inputs(seen: _Look) -> Step:
-    missing, given = [], []
+    missing: list[str] = []
+    given: list[str] = []
     for kind, file in stored_inputs(seen.project.inputs).items():
         if file is None:
             continue
         try:
-            path = seen.folder.input_file(kind, seen.project)
+            (given if seen.folder.is_there(kind, seen.project) else missing).append(kind)
         except ApiError as error:
             return _step("error", error.message)
-        if path is None or (isinstance(path, Path) and not path.is_file()):
-            missing.append(kind)
-        else:
-            given.append(kind)
     if "video" in missing:
         return _step("todo", "Choose the video, or send it.")
     if missing:

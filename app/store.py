@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from app.errors import ApiError, Conflict, Invalid, Missing, Refused
 from app.history import HISTORY_FILE, Entry, Head, History
@@ -30,6 +30,8 @@ from core.project import (
     write_project,
 )
 from core.storage import File, file_at
+
+_AnyFile = TypeVar("_AnyFile", bound=File)
 
 RESULTS_FOLDER = "results"
 CACHE_FOLDER = "cache"
@@ -163,8 +165,7 @@ class ProjectFolder:
         Raises:
             Missing: none is given, or it is not there.
         """
-        file = self.input_file("video", project)
-        return self.require_input("video", project) if file is None or isinstance(file, Path) else file
+        return _there("video", self.input_file("video", project))
 
     def require_input(self, kind: str, project: Project | None = None) -> Path:
         """Return where an input lies on this computer.
@@ -172,12 +173,16 @@ class ProjectFolder:
         Raises:
             Missing: none is given, or it is not there.
         """
-        path = self.input_path(kind, project)
-        if path is None:
-            raise Missing(f"No {kind} is given; choose one in the inputs.", path=f"inputs.{kind}")
-        if not path.is_file():
-            raise Missing(f"{path.name}: not found; choose the {kind} again in the inputs.", path=f"inputs.{kind}")
-        return path
+        return _there(kind, self.input_path(kind, project))
+
+    def is_there(self, kind: str, project: Project | None = None) -> bool:
+        """Whether an input is given and, as far as can be told without a network, can be read.
+
+        Raises:
+            Refused: outside the allowed folders.
+        """
+        file = self.input_file(kind, project)
+        return file.is_file() if isinstance(file, Path) else file is not None
 
     def free_name(self, wanted: str) -> str:
         """Return a file name for the project folder, as wanted but free of what could do harm.
@@ -245,6 +250,19 @@ def stored_inputs(inputs: Inputs) -> dict[str, str | None]:
     """Return the file of each kind of input as `project.json` has it."""
     gps = inputs.gps.file if inputs.gps else None
     return {"video": inputs.video, "cloud": inputs.cloud, "lens": inputs.lens, "gps": gps}
+
+
+def _there(kind: str, file: _AnyFile | None) -> _AnyFile:
+    """Return an input's file if one is given and, on this computer, can be found.
+
+    Raises:
+        Missing: none is given, or it is not there.
+    """
+    if file is None:
+        raise Missing(f"No {kind} is given; choose one in the inputs.", path=f"inputs.{kind}")
+    if isinstance(file, Path) and not file.is_file():
+        raise Missing(f"{file.name}: not found; choose the {kind} again in the inputs.", path=f"inputs.{kind}")
+    return file
 
 
 def with_inputs(inputs: Inputs, files: dict[str, str]) -> Inputs:

@@ -218,8 +218,7 @@ class _Trials:
         self._evidence = evidence
         self._frames = evidence.recording.selected(chosen)
         self._speed = np.nan_to_num(np.stack([_mean_seen(evidence.speed[group]) for group in groups]))
-        poses = evidence.ground.known_poses
-        self._start = PoseFit(*(getattr(poses, name)[chosen] for name in PoseFit.__dataclass_fields__))
+        self._start = evidence.ground.known_poses.selected(chosen)
         self._weight = {target.name: self._target_weight(target) for target in evidence.project.targets}
 
     def attempt(self, correction: Floats) -> _Trial:

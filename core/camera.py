@@ -7,7 +7,7 @@ raw pixels to rays and back.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,6 +47,10 @@ class PoseFit:
     weight: Floats
     normal: Floats
     sigma: Floats
+
+    def selected(self, chosen: NDArray[np.int64]) -> PoseFit:
+        """Return some of the frames, by their place (M,) in these arrays."""
+        return PoseFit(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
 
 def exponential(omega: ArrayLike) -> Floats:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from core.coordinates import Floats, read_only
+from core.coordinates import Floats, batches, read_only
 from core.errors import InputError
 from core.point_files import PointTable, read_pcd, read_ply, read_text
 from core.progress import Progress, silent
@@ -81,8 +81,8 @@ class Cloud:
         """Smallest and largest world coordinates, each (3,)."""
         return self.points_m.min(axis=0) + self.origin_m, self.points_m.max(axis=0) + self.origin_m
 
-    def select(self, which: NDArray[Any]) -> Cloud:
-        """Return the cloud of some points, given by mask or indices, with the same origin."""
+    def select(self, which: NDArray[Any] | slice) -> Cloud:
+        """Return the cloud of some points, given by mask, indices or a slice, with the same origin."""
         return replace(
             self,
             points_m=self.points_m[which],
@@ -526,11 +526,11 @@ def _near_places(points: Floats, places: Floats, radius_m: float) -> NDArray[np.
         for north in (-1, 0, 1):
             wanted[own[:, 0] + east, own[:, 1] + north] = True
     parts = []
-    for start in range(0, len(points), PASS_POINTS):
-        cell = np.floor((points[start : start + PASS_POINTS, :2] - low) / radius_m)
+    for batch in batches(len(points), PASS_POINTS):
+        cell = np.floor((points[batch, :2] - low) / radius_m)
         inside = np.flatnonzero(((cell >= 0) & (cell < size)).all(axis=1))
         cell = cell[inside].astype(np.int64)
-        parts.append(start + inside[wanted[cell[:, 0], cell[:, 1]]])
+        parts.append(batch.start + inside[wanted[cell[:, 0], cell[:, 1]]])
     return np.concatenate(parts)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -93,7 +91,8 @@ def solve_ground(
     focal = float(lens.focal_px.mean())
     least = LEAST_SIGMA_PX / focal
     poses = fit_poses(rays, weight, points, pose0, sigma_floor=least)
-    trusted = weight * _trust(poses) * ~_standing(rays, weight, points, poses, pose0, least)
+    trusted = weight * _trust(poses)
+    trusted *= ~_standing(rays, trusted, points, poses, pose0, least)
     poses = fit_poses(rays, trusted, points, poses, iterations=4, sigma_floor=least)
     agreeing = np.where(trusted > 0, poses.weight / np.maximum(trusted, 1e-300), 0.0)
     inlier = agreeing > 0.1
@@ -133,8 +132,8 @@ def _standing(rays: Floats, weight: Floats, points_m: Floats, poses: PoseFit, po
         least_sigma: of any feature in a frame, rays.
     """
     some = evenly_spread(len(rays), STANDING_FRAMES)
-    rays, weight = rays[some], weight[some] * _trust(poses)
-    poses = PoseFit(*(getattr(poses, each.name)[some] for each in fields(poses)))
+    rays, weight = rays[some], weight[some]
+    poses = poses.selected(some)
     standing = np.zeros(len(points_m), dtype=bool)
     for _ in range(STANDING_ROUNDS):
         height, sigma = _heights(points_m, poses, pose0, least_sigma)

@@ -14,7 +14,7 @@ import tifffile
 from numpy.typing import ArrayLike, NDArray
 
 from core.cloud import RELIEF_REACH_M, Cloud, GroundPlane
-from core.coordinates import Bools, Floats, OrthoGrid, apply_homography
+from core.coordinates import Bools, Floats, OrthoGrid, apply_homography, batches
 from core.errors import InputError
 from core.lens import Lens
 from core.progress import Progress, silent
@@ -222,8 +222,8 @@ def _points_of(
     """Chunks of points of a strip: flat pixel number, z, what to show."""
     grid = strip.grid
     corner = np.array([grid.west_m, grid.north_m]) - cloud.origin_m[:2]
-    for start in range(0, len(cloud), _CHUNK_POINTS):
-        points = cloud.points_m[start : start + _CHUNK_POINTS]
+    for batch in batches(len(cloud), _CHUNK_POINTS):
+        points = cloud.points_m[batch]
         column = np.floor((points[:, 0] - corner[0]) / grid.pixel_size_m)
         row = np.floor((corner[1] - points[:, 1]) / grid.pixel_size_m) - strip.first_row
         inside = np.flatnonzero(
@@ -231,7 +231,7 @@ def _points_of(
         )
         if len(inside):
             cells = row[inside].astype(np.int64) * grid.width + column[inside].astype(np.int64)
-            yield cells, points[inside, 2].astype(np.float32), values[start + inside]
+            yield cells, points[inside, 2].astype(np.float32), values[batch.start + inside]
 
 
 def _without_hidden(top: Float32, pixel_size_m: float) -> Float32:

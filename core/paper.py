@@ -101,7 +101,7 @@ class SiftGround:
         """Return H_ray_ray0 and the matched features' raw pixels (N, 2), nan where unmatched; None if lost."""
         if predicted_H_ray_ray0 is None:
             # A hovering camera may well see what it saw in the reference frame; by chance few features seem to match.
-            found = self._fit(luma, np.eye(3), len(self._rays0) // 2)
+            found = self._fit(luma, np.eye(3), max(LEAST_MATCHES, len(self._rays0) // 2))
         else:
             found = self._fit(luma, predicted_H_ray_ray0)
         if found is None and (searched := self._finder.search(luma)) is not None:
@@ -112,11 +112,11 @@ class SiftGround:
         """Return what `find` does from where a homography leads one to expect the features, or None."""
         matched = self._match(luma, self._lens.raw_from_rays(apply_homography(H_ray_ray0, self._rays0)))
         good = np.isfinite(matched).all(axis=1)
-        if good.sum() < max(least, LEAST_MATCHES):
+        if good.sum() < least:
             return None
         rays = self._lens.rays_from_raw(matched[good])
         H, inlier = fit_homography(self._rays0[good], rays, tolerance=1.0 / float(self._lens.focal_px.mean()))
-        return None if H is None or inlier.sum() < max(least, LEAST_MATCHES) else (H, matched)
+        return None if H is None or inlier.sum() < least else (H, matched)
 
     def _match(self, luma: Luma, expected_raw: Floats) -> Floats:
         """Return each feature's match (N, 2) among those found within the window around its expected place."""

@@ -47,9 +47,7 @@ class Relief:
 
     def at(self, xy_m: Floats) -> Floats:
         """Return elevations (N,) at world places (N, 2), bilinear; 0 beyond the raster."""
-        column = (xy_m[:, 0] - self.west_m) / self.cell_m
-        row = (xy_m[:, 1] - self.south_m) / self.cell_m
-        places = np.nan_to_num(np.stack([row, column]), nan=-1e6)
+        places = self._places(xy_m)
         return np.asarray(map_coordinates(self.elevation_m, places, order=1, mode="constant", cval=0.0))
 
     def shows_ground(self, rays: Floats, pose: Pose, origin_m: Floats, reach_m: float) -> Bools:
@@ -70,10 +68,13 @@ class Relief:
 
     def _of_cell(self, raster: Floats, xy_m: Floats) -> Floats:
         """Return the value (N,) of the cell in which each place (N, 2) lies; 0 beyond the raster."""
-        places = np.nan_to_num((xy_m - [self.west_m, self.south_m]) / self.cell_m, nan=-1e6)
-        column, row = np.rint(np.clip(places, -1e6, 1e6)).astype(np.int64).T
-        inside = (row >= 0) & (row < raster.shape[0]) & (column >= 0) & (column < raster.shape[1])
-        return np.where(inside, raster[np.where(inside, row, 0), np.where(inside, column, 0)], 0.0)
+        return np.asarray(map_coordinates(raster, self._places(xy_m), order=0, mode="grid-constant", cval=0.0))
+
+    def _places(self, xy_m: Floats) -> Floats:
+        """Return rows and columns (2, N) of world places (N, 2), far beyond the raster where these are nan."""
+        column = (xy_m[:, 0] - self.west_m) / self.cell_m
+        row = (xy_m[:, 1] - self.south_m) / self.cell_m
+        return np.nan_to_num(np.stack([row, column]), nan=-1e6)
 
     def save(self, file: Path) -> None:
         """Write the raster for the next run."""
@@ -120,9 +121,8 @@ def rasterise(cloud: Cloud, plane: GroundPlane, extent_m: tuple[float, float, fl
 def _standing(cloud: Cloud, plane: GroundPlane, corner_m: Floats, cell_m: float, shape: tuple[int, ...]) -> Floats:
     """Return how high above the plane lies what most points of a cell show, 0 where that is ground, or nothing."""
     points, high, height = (np.zeros(shape[0] * shape[1]) for _ in range(3))
-    total = len(cloud.points_m)
-    for batch in batches(total, PASS_POINTS):
-        some = cloud.select(np.arange(batch.start, min(batch.stop, total)))
+    for batch in batches(len(cloud.points_m), PASS_POINTS):
+        some = cloud.select(batch)
         cells = np.rint((some.points_m[:, :2] + some.origin_m[:2] - corner_m) / cell_m).astype(np.int64)
         inside = ((cells >= 0) & (cells < np.array(shape[::-1]))).all(axis=1)
         number, above = cells[inside] @ [1, shape[1]], plane.height_of(some)[inside]

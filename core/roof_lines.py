@@ -156,8 +156,8 @@ class LineTracker:
         """Return the line in a frame; see `find_strips`."""
         return find_strips([self], luma, to_raw, search_px=search_px)[0]
 
-    def search(self, luma: Luma, path: Floats, search_px: float | None) -> _Found:
-        """Return where the strip lies in a frame, good to a tenth of a pixel.
+    def search(self, luma: Luma, path: Floats, search_px: float | None) -> _Strip | LineMatch:
+        """Return the strip as it lies in a frame, good to a tenth of a pixel; where it is not recognised, no edges.
 
         Args:
             path: (n, 2) where its axis should lie, raw pixels.
@@ -165,13 +165,13 @@ class LineTracker:
         """
         section = self._section(luma, path, self._reach)
         if section is None:
-            return _Found(None, 0.0)
+            return NOT_FOUND
         reach = min(self._half_band, int(np.ceil(search_px if search_px is not None else self._half_band)))
         offset, correlation = self._locate(section, reach)
         if correlation < LEAST_CORRELATION:
-            return _Found(None, correlation)
+            return LineMatch(NOT_FOUND.edges_raw, correlation)
         line = section.across + self.profile.offset_px + self.profile.tilt_px * section.x + offset
-        return _Found(_Strip(section, line, self.profile), correlation)
+        return _Strip(section, line, self.profile, correlation)
 
     def _section(self, luma: Luma, raw: Floats, half: int) -> _Section | None:
         """Cut the band about raw pixels (n, 2) out of a frame, or None where it leaves the frame almost everywhere."""
@@ -222,18 +222,20 @@ class _Strip:
 
     Attributes:
         line: (n,) its mid-line in each column of the section, good to a tenth of a pixel.
+        correlation: of its cross profile with the reference's.
     """
 
     section: _Section
     line: Floats
     profile: StripProfile
+    correlation: float
 
     @cached_property
     def members(self) -> Floats:
         """(STATIONS, n) share of each column that belongs to each station."""
         return _membership(self.section.place)
 
-    def matched(self, shift: Floats, strength: Floats, correlation: float) -> LineMatch:
+    def matched(self, shift: Floats, strength: Floats) -> LineMatch:
         """Return the match that shifts (2, STATIONS) of both edges make, where they can be believed."""
         profile, axis, members = self.profile, self.section.axis, self.members
         count = members.sum(axis=1)
@@ -246,15 +248,7 @@ class _Strip:
         found[..., 1 - axis] = np.where(good, middle + SIDES * profile.width_px / 2 + shift, np.nan).T
         width = found[:, 1, 1 - axis] - found[:, 0, 1 - axis]
         found[~(np.abs(width - profile.width_px) < 0.3 * profile.width_px + 0.7)] = np.nan
-        return LineMatch(edges_raw=found, correlation=correlation)
-
-
-@dataclass(frozen=True)
-class _Found:
-    """A strip, or None where it was not recognised, and the correlation of its cross profile with the reference's."""
-
-    strip: _Strip | None
-    correlation: float
+        return LineMatch(edges_raw=found, correlation=self.correlation)
 
 
 def find_strips(
@@ -269,15 +263,10 @@ def find_strips(
     """
     paths = to_raw(np.concatenate([tracker.axis_points for tracker in trackers])).reshape(len(trackers), -1, 2)
     found = [tracker.search(luma, path, search_px) for tracker, path in zip(trackers, paths, strict=True)]
-    strips = [one.strip for one in found if one.strip is not None]
+    strips = [one for one in found if isinstance(one, _Strip)]
     shift, strength = _extremes(strips) if strips else (np.empty((0, 2, STATIONS)),) * 2
     extremes = iter(zip(shift, strength, strict=True))
-    return [
-        LineMatch(NOT_FOUND.edges_raw, one.correlation)
-        if one.strip is None
-        else one.strip.matched(*next(extremes), one.correlation)
-        for one in found
-    ]
+    return [one.matched(*next(extremes)) if isinstance(one, _Strip) else one for one in found]
 
 
 def _profiles(luma: Luma, along: Floats, middle: NDArray[np.int64], half: int, axis: int) -> Singles:

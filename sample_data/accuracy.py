@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.coordinates import Floats
-from core.intervals import within
+from core.intervals import during
 from core.measure import measure
 from core.measurements import MeasurementStore, Recording
 from core.project import Drift, Intervals, Project
@@ -258,8 +258,8 @@ def _scored(
 ) -> Score:
     got = np.stack([history.p1_m, history.p2_m], axis=1)
     sigma = np.stack([history.p1_sigma_m, history.p2_sigma_m], axis=1)
-    still = _in(history.time_s, intervals.pre_event)
-    residual = _in(history.time_s, intervals.residual)
+    still = during(history.time_s, intervals.pre_event)
+    residual = during(history.time_s, intervals.residual)
     error = got - (true - (true[still].mean(axis=0) if still.any() else true[0]))
     seen = ~hidden
     rms = np.sqrt(np.nanmean(error**2, axis=0))
@@ -279,10 +279,6 @@ def _scored(
         frame_ms=frame_ms,
         limit=LIMITS.get(scene, NO_LIMIT),
     )
-
-
-def _in(time_s: Floats, interval: tuple[float, float] | None) -> NDArray[np.bool_]:
-    return np.zeros(len(time_s), dtype=bool) if interval is None else within(time_s, interval)
 
 
 # --- the published method --------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +25,7 @@ from app.videos import is_read_through, video_info
 from core.errors import InputError
 from core.lens import read_lens, require_image_size
 from core.project import Project
-from core.storage import FarFile, File
+from core.storage import File
 from core.validation import read_gps
 from core.video import frame_index
 
@@ -106,32 +107,21 @@ def inputs(folder: Folder, here: Here) -> dict[str, Any]:
 
 
 def _understood(here: Context, folder: ProjectFolder, project: Project, kind: str) -> dict[str, Any] | None:
-    file = stored_inputs(project.inputs)[kind]
-    if file is None:
+    named = stored_inputs(project.inputs)[kind]
+    if named is None:
         return None
-    readers = {"cloud": _cloud, "lens": _lens, "gps": _gps}
+    readers: dict[str, Callable[..., dict[str, Any]]] = {"video": _video, "cloud": _cloud, "lens": _lens, "gps": _gps}
     try:
-        if kind == "video":
-            return _video(here, folder, file, folder.require_video(project))
-        path = folder.require_input(kind, project)
-        return {"file": file, "path": str(path), "size": path.stat().st_size} | readers[kind](
-            here, folder, project, path
-        )
+        file = folder.require_video(project) if kind == "video" else folder.require_input(kind, project)
+        facts = {"file": named, "path": str(file), "size": fingerprint(file)[1]}
+        return facts | readers[kind](here, folder, project, file)
     except (InputError, ApiError) as error:
-        return {"file": file, "error": {"message": problem_of(error)}}
+        return {"file": named, "error": {"message": problem_of(error)}}
 
 
-def _video(here: Context, folder: ProjectFolder, named: str, video: File) -> dict[str, Any]:
+def _video(here: Context, folder: ProjectFolder, project: Project, video: File) -> dict[str, Any]:
     info = video_info(video)
-    facts = {
-        "file": named,
-        "path": str(video),
-        "size": fingerprint(video)[1],
-        "width": info.width,
-        "height": info.height,
-        "codec": info.codec,
-        "rotation_deg": info.rotation_deg,
-    }
+    facts = {"width": info.width, "height": info.height, "codec": info.codec, "rotation_deg": info.rotation_deg}
     if not is_read_through(here.hub, folder, video):
         told = {"rate_hz": info.rate_hz, "frames": info.frames, "duration_s": info.duration_s}
         return facts | told | {"variable_rate": None}
@@ -152,8 +142,8 @@ def _cloud(here: Context, folder: ProjectFolder, project: Project, path: Path) -
 
 def _lens(here: Context, folder: ProjectFolder, project: Project, path: Path) -> dict[str, Any]:
     lens = read_lens(path)
-    video = folder.input_file("video", project)
-    if isinstance(video, FarFile) or (video is not None and video.is_file()):
+    if folder.is_there("video", project):
+        video = folder.require_video(project)
         info = video_info(video)
         require_image_size(lens, width=info.width, height=info.height, lens_file=path.name, video_file=video.name)
     return {

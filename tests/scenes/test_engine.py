@@ -278,7 +278,7 @@ def test_a_chunk_may_begin_anywhere(clip, history, tmp_path, monkeypatch):
 
 
 MEMORY_OF_A_RUN = """
-import shutil, sys
+import sys
 from pathlib import Path
 from core.measure import measure
 from core.measurements import MeasurementStore
