@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.coordinates import Floats, apply_homography, finite_rows
-from core.ground import LEAST_SCORE, choose_features_within, homography_jacobian
+from core.ground import ALIKE_SCORE, View, choose_features_within, homography_jacobian
 from core.lens import Lens
 from core.motion import LineSet, RigidFit, fit_line, is_determined, rigid_from_points, rough_rigid_from_lines
-from core.patches import PatchTracker
+from core.patches import PatchTracker, Singles
 from core.project import LINE_NAMES, Target
 from core.roof_lines import NOT_FOUND, STATIONS, LineMatch, LineTracker, find_strips
 from core.video import Luma
@@ -38,6 +38,8 @@ CONFIRM_EVERY = 15
 # Another place than where strips were found must show this part of them at least.
 AS_WELL = 0.8
 POINTS = 160
+# Patches of two noisy frames stay near where they are looked for: so many times they are looked for where they were.
+VIEW_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -88,8 +90,18 @@ class Follower(Protocol):
 
     reference_raw: Floats
 
-    def find(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool) -> TargetMatch:
-        """Return the target in a frame, searched for without a prediction where that is None or misleads."""
+    def find(
+        self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool, is_view: bool = False
+    ) -> TargetMatch:
+        """Return the target in a frame, searched for without a prediction where that is None or misleads.
+
+        Args:
+            luma: the frame.
+            H_ray_ray0: of the camera.
+            predicted: where the target should be.
+            confirm: whether to make sure that nothing beside it has been taken for it.
+            is_view: as for `PatchTracker.track`.
+        """
 
 
 @dataclass(frozen=True)
@@ -151,7 +163,9 @@ class LinesFollower:
         self._lines = LineSet(np.array([n for n, _ in lines]), np.array([o for _, o in lines]), self._centre)
         self._finder = TargetFinder(luma, ends.reshape(-1, 2), lens, scale)
 
-    def find(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool) -> TargetMatch:
+    def find(
+        self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool, is_view: bool = False
+    ) -> TargetMatch:
         """Return the lines in a frame; see `Follower.find`."""
         found = self._measure(luma, H_ray_ray0, predicted) if predicted is not None else None
         if found is not None and self._may_be_kept(luma, H_ray_ray0, found.apparent, confirm):
@@ -195,37 +209,64 @@ class PointsFollower:
         self._lens = lens
         points = choose_features_within(luma, lens.raw_from_rays(region), POINTS, name)
         self.reference_raw = points
-        self._patches = PatchTracker(luma, points)
+        self.patches = PatchTracker(luma, points)
         self._rays0 = lens.rays_from_raw(points)
         self._J0_inverse = np.linalg.inv(lens.jacobian_raw_rays(self._rays0))
         self._centre = self._rays0.mean(axis=0)
         self._finder = TargetFinder(luma, region, lens, scale)
 
-    def find(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool) -> TargetMatch:
+    def views(self, view: View) -> Singles:
+        """Return the patches as a view shows them; see `PatchTracker.views`."""
+        seen = self._finder.search(view.luma, view.H_ray_ray0)
+        apparent = None if seen is None else Apparent(seen, 0.0)
+        for _ in range(VIEW_ROUNDS):
+            if apparent is not None:
+                apparent = self._measure(view.luma, view.H_ray_ray0, apparent, least_score=ALIKE_SCORE).apparent
+        raw, ref_from_current = self._expected(view.H_ray_ray0, apparent or Apparent.none())
+        return self.patches.views(view.luma, np.full_like(raw, np.nan) if apparent is None else raw, ref_from_current)
+
+    def find(
+        self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool, is_view: bool = False
+    ) -> TargetMatch:
         """Return the patches in a frame; see `Follower.find`."""
-        found = self._measure(luma, H_ray_ray0, predicted) if predicted is not None else None
+        found = self._measure(luma, H_ray_ray0, predicted, is_view=is_view) if predicted is not None else None
         if found is not None and found.apparent is not None:
-            return found
+            # As for the ground: in noise, patches stay near where they are looked for.
+            again = self.patches.is_averaged
+            return self._measure(luma, H_ray_ray0, found.apparent, is_view=is_view) if again else found
         seen = self._finder.search(luma, H_ray_ray0)
         if seen is None:
             return TargetMatch(np.full_like(self.reference_raw, np.nan), None)
         rotation = predicted.rotation_rad if predicted is not None else 0.0
-        coarse = self._measure(luma, H_ray_ray0, Apparent(seen, rotation))
-        return coarse if coarse.apparent is None else self._measure(luma, H_ray_ray0, coarse.apparent)
+        coarse = self._measure(luma, H_ray_ray0, Apparent(seen, rotation), is_view=is_view)
+        return coarse if coarse.apparent is None else self._measure(luma, H_ray_ray0, coarse.apparent, is_view=is_view)
 
-    def _measure(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent) -> TargetMatch:
-        moved = predicted.apply(self._rays0, self._centre)
-        rays = apply_homography(H_ray_ray0, moved)
-        c, s = np.cos(predicted.rotation_rad), np.sin(predicted.rotation_rad)
-        turn = np.array([[c, -s], [s, c]])
-        J = self._lens.jacobian_raw_rays(rays) @ homography_jacobian(H_ray_ray0, moved) @ turn @ self._J0_inverse
-        matches = self._patches.track(luma, self._lens.raw_from_rays(rays), np.linalg.inv(J))
-        raw = np.where((matches.score >= LEAST_SCORE)[:, None], matches.raw, np.nan)
+    def _measure(
+        self,
+        luma: Luma,
+        H_ray_ray0: Floats,
+        predicted: Apparent,
+        *,
+        least_score: float | None = None,
+        is_view: bool = False,
+    ) -> TargetMatch:
+        matches = self.patches.track(luma, *self._expected(H_ray_ray0, predicted), is_view=is_view)
+        known = matches.score >= (least_score or self.patches.least_score)
+        raw = np.where(known[:, None], matches.raw, np.nan)
         rays0 = apply_homography(np.linalg.inv(H_ray_ray0), self._lens.rays_from_raw(raw))
         if finite_rows(raw).sum() < max(6, len(raw) // 4):
             return TargetMatch(np.full_like(raw, np.nan), None)
         fit = rigid_from_points(rays0[None], np.ones((1, len(rays0))), self._rays0, self._centre)
         return TargetMatch(raw, _apparent_of(fit))
+
+    def _expected(self, H_ray_ray0: Floats, apparent: Apparent) -> tuple[Floats, Floats]:
+        """Return where the patches should be, (N, 2) raw pixels, and how they are deformed, as `PatchTracker.track`."""
+        moved = apparent.apply(self._rays0, self._centre)
+        rays = apply_homography(H_ray_ray0, moved)
+        c, s = np.cos(apparent.rotation_rad), np.sin(apparent.rotation_rad)
+        turn = np.array([[c, -s], [s, c]])
+        J = self._lens.jacobian_raw_rays(rays) @ homography_jacobian(H_ray_ray0, moved) @ turn @ self._J0_inverse
+        return self._lens.raw_from_rays(rays), np.linalg.inv(J)
 
 
 def _apparent_of(fit: RigidFit) -> Apparent | None:

@@ -6,7 +6,7 @@ frame serves to predict where to look; the camera poses of the result are solved
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,13 +17,19 @@ from numpy.typing import NDArray
 from core.coordinates import Bools, Floats, apply_homography, finite_rows
 from core.errors import InputError
 from core.lens import Lens
-from core.patches import HALF_PX, MARGIN_PX, Matches, PatchTracker
+from core.patches import HALF_PX, MARGIN_PX, Matches, PatchTracker, Singles
 from core.video import Luma
 
 # More give no better pose: what compression gets wrong, it gets wrong for all of them alike.
 FEATURES = 180
-# Correlation below which a patch shows something else than in the reference frame.
-LEAST_SCORE = 0.6
+# So many frames after the reference frame an encoder no longer repeats it; where they correlate with it by less than
+# the second, it is too noisy to go by itself. Two noisy views are alike by more than chance from the third on.
+JUDGED_BY = 12
+CLEAN_SCORE = 0.96
+ALIKE_SCORE = 0.2
+# Frames after the reference frame over which a noisy reference is averaged, and the fewest that do.
+VIEWS = 64
+LEAST_VIEWS = 8
 # Ground points needed before a frame's homography is believed.
 LEAST_POINTS = 12
 # Widths of the reduced pictures in which features are chosen and a lost camera is found again, pixels.
@@ -44,6 +50,21 @@ class GroundMatch:
     matches: Matches
     H_ray_ray0: Floats
     inliers: int
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame near the reference frame.
+
+    Attributes:
+        luma: (height, width).
+        H_ray_ray0: (3, 3) as in `GroundMatch`.
+        score: the usual correlation of its patches with the reference frame's.
+    """
+
+    luma: Luma
+    H_ray_ray0: Floats
+    score: float
 
 
 @dataclass(frozen=True)
@@ -167,29 +188,49 @@ class GroundTracker:
         self._J0_inverse = np.linalg.inv(lens.jacobian_raw_rays(self._rays0))
         self._finder = CameraFinder(luma, lens, allowed)
 
-    def find(self, luma: Luma, predicted_H_ray_ray0: Floats | None) -> GroundMatch | None:
+    def look_ahead(self, lumas: Iterable[Luma]) -> Iterator[View]:
+        """Yield the frames after the reference frame as far as they can be followed, however noisy."""
+        H = np.eye(3)
+        for luma in lumas:
+            found = self._refine(luma, H, least_score=ALIKE_SCORE)
+            if found is None:
+                return
+            H = found.H_ray_ray0
+            yield View(luma, H, float(np.nanmedian(found.matches.score)))
+
+    def views(self, view: View) -> Singles:
+        """Return the patches as a view shows them; see `PatchTracker.views`."""
+        expected = self.predict(view.H_ray_ray0)
+        return self.patches.views(view.luma, expected.raw, expected.ref_from_current)
+
+    def find(self, luma: Luma, predicted_H_ray_ray0: Floats | None, *, is_view: bool = False) -> GroundMatch | None:
         """Return the ground in a frame, or None where it cannot be recognised.
 
         Args:
             luma: the frame.
             predicted_H_ray_ray0: from the frames before; None to search without a prediction.
+            is_view: as for `PatchTracker.track`.
         """
         # A hovering camera may well see what it saw in the reference frame.
         expected = np.eye(3) if predicted_H_ray_ray0 is None else predicted_H_ray_ray0
-        found = self._refine(luma, expected)
+        found = self._refine(luma, expected, is_view=is_view)
         if found is not None and found.inliers >= max(LEAST_POINTS, len(self.patches) // 4):
-            return found
+            # In noise patches stay near where they are looked for: let that be where this very frame shows them.
+            again = self._refine(luma, found.H_ray_ray0, is_view=is_view) if self.patches.is_averaged else None
+            return again or found
         searched = self._finder.search(luma)
         if searched is None:
             return None
-        coarse = self._refine(luma, searched)
+        coarse = self._refine(luma, searched, is_view=is_view)
         # The search is good to a few pixels: a second pass from its result gets every patch home.
-        return self._refine(luma, coarse.H_ray_ray0) if coarse is not None else None
+        return self._refine(luma, coarse.H_ray_ray0, is_view=is_view) if coarse is not None else None
 
-    def _refine(self, luma: Luma, H_ray_ray0: Floats) -> GroundMatch | None:
+    def _refine(
+        self, luma: Luma, H_ray_ray0: Floats, *, least_score: float | None = None, is_view: bool = False
+    ) -> GroundMatch | None:
         expected = self.predict(H_ray_ray0)
-        matches = self.patches.track(luma, expected.raw, expected.ref_from_current)
-        good = np.flatnonzero(matches.score >= LEAST_SCORE)
+        matches = self.patches.track(luma, expected.raw, expected.ref_from_current, is_view=is_view)
+        good = np.flatnonzero(matches.score >= (least_score or self.patches.least_score))
         if len(good) < LEAST_POINTS:
             return None
         focal = float(self._lens.focal_px.mean())

@@ -7,9 +7,10 @@ up on a few frames before its first, so that its numbers are those of an uninter
 
 from __future__ import annotations
 
+import itertools
 import pickle
 import threading
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Protocol
@@ -18,12 +19,24 @@ import cv2
 
 from core.chunks import HEAD_START, WARM_UP, Chunk, missing_chunks
 from core.cluster import Cluster
-from core.following import CONFIRM_EVERY, make_follower
-from core.ground import FEATURES, GroundTracker, choose_features, ground_mask
+from core.errors import InputError
+from core.following import CONFIRM_EVERY, PointsFollower, make_follower
+from core.ground import (
+    CLEAN_SCORE,
+    FEATURES,
+    JUDGED_BY,
+    LEAST_VIEWS,
+    VIEWS,
+    GroundTracker,
+    View,
+    choose_features,
+    ground_mask,
+)
 from core.measurements import FrameMeasurement, MeasurementStore, Reference
+from core.patches import PatchTracker, Singles
 from core.prediction import MeasureSetup, nothing_measured, predict_apparent, predict_homography
 from core.progress import CancelToken, Progress, silent
-from core.video import FrameIndex, FramesAhead, Luma, frame_index, read_frame
+from core.video import FrameIndex, FramesAhead, Luma, available_cores, frame_index, read_frames
 from core.workers import Helpers, Order
 
 
@@ -40,23 +53,49 @@ def make_measurer(
     setup: MeasureSetup,
     reference: Reference | None = None,
     index: FrameIndex | None = None,
-    luma: Luma | None = None,
+    begun: FramesAhead | None = None,
 ) -> Measurer:
     """Return the measurer of the setup's method, its eyes on the reference frame.
 
     Args:
         reference: of an earlier recording, to go on with exactly its features; chosen anew where None.
         index: of the video, where it is known already.
-        luma: the reference frame, where it is at hand; read where None.
-    """
-    if luma is None:
-        luma = read_frame(setup.video, setup.reference_frame, index=index).luma
-    if setup.method == "paper":
-        # Brings a library along that takes a while to load.
-        from core.paper import PaperMeasurer
+        begun: frames of which none is taken yet, where decoding has begun; if with the reference frame, it need not be
+            decoded twice.
 
-        return PaperMeasurer(luma, setup)
-    return GeometricMeasurer(luma, setup, reference)
+    Raises:
+        InputError: the video cannot be read, or the reference frame shows nothing to hold on to.
+    """
+    first = setup.reference_frame
+    with ExitStack() as stack:
+        if begun is None or begun.start != first:
+            cores = available_cores()
+            stop = first + 1 + JUDGED_BY
+            begun = stack.enter_context(FramesAhead(setup.video, first, stop, threads=cores, index=index))
+        lumas = (frame.luma for frame in begun.peek())
+        luma = next(lumas, None)
+        if luma is None:
+            raise InputError(f"{setup.video}: has no frame {first}; choose a smaller reference_frame.")
+        if setup.method == "paper":
+            # Brings a library along that takes a while to load.
+            from core.paper import PaperMeasurer
+
+            return PaperMeasurer(luma, setup)
+        measurer = GeometricMeasurer(luma, setup, reference)
+        if measurer.finds_noise(itertools.islice(lumas, JUDGED_BY)):
+            measurer.denoise(
+                frame.luma for frame in read_frames(setup.video, first + 1, first + 1 + VIEWS, index=index)
+            )
+        return measurer
+
+
+class Patched(Protocol):
+    """What is followed by patches of the reference frame."""
+
+    patches: PatchTracker
+
+    def views(self, view: View) -> Singles:
+        """Return the patches as a view shows them; see `PatchTracker.views`."""
 
 
 class GeometricMeasurer:
@@ -71,16 +110,36 @@ class GeometricMeasurer:
         }
         targets_raw = {name: follower.reference_raw for name, follower in self._followers.items()}
         self.reference = Reference(points, targets_raw)
+        self._first = setup.reference_frame
+        self._views = range(0)
+
+    def finds_noise(self, following: Iterable[Luma]) -> bool:
+        """Whether the reference frame is too noisy to go by itself, as a few frames after it tell."""
+        scores = [view.score for view in self._ground.look_ahead(following)]
+        return bool(scores) and scores[-1] < CLEAN_SCORE
+
+    def denoise(self, following: Iterable[Luma]) -> None:
+        """Average patches over the frames after the reference frame."""
+        points = [follower for follower in self._followers.values() if isinstance(follower, PointsFollower)]
+        patched: list[Patched] = [self._ground, *points]
+        seen = [[each.views(view) for each in patched] for view in self._ground.look_ahead(following)]
+        if len(seen) < LEAST_VIEWS:
+            return
+        for each, views in zip(patched, zip(*seen, strict=True), strict=True):
+            each.patches.denoise(views)
+        self._views = range(self._first, self._first + 1 + len(seen) // 2)
 
     def measure(self, luma: Luma, *, frame: int, time_s: float, before: Sequence[FrameMeasurement]) -> FrameMeasurement:
         """Return what a frame shows; see `Measurer.measure`."""
-        ground = self._ground.find(luma, predict_homography(before))
+        is_view = frame in self._views
+        ground = self._ground.find(luma, predict_homography(before), is_view=is_view)
         if ground is None:
             return nothing_measured(self.reference, frame, time_s)
         targets_raw, apparent = {}, {}
         for name, follower in self._followers.items():
             predicted = predict_apparent(before, name, time_s)
-            match = follower.find(luma, ground.H_ray_ray0, predicted, confirm=frame % CONFIRM_EVERY == 0)
+            confirm = frame % CONFIRM_EVERY == 0
+            match = follower.find(luma, ground.H_ray_ray0, predicted, confirm=confirm, is_view=is_view)
             targets_raw[name], apparent[name] = match.raw, match.apparent
         return FrameMeasurement(frame, time_s, ground.H_ray_ray0, ground.matches.raw, targets_raw, apparent)
 
@@ -113,12 +172,6 @@ def measure_chunk(
             history = [*history[-1:], measured]
             if frame.index >= chunk.start:
                 yield measured
-
-
-def _reference_in(begun: FramesAhead | None, setup: MeasureSetup) -> Luma | None:
-    """Return the reference frame if decoding has begun with it, so that it need not be decoded twice."""
-    first = begun.first() if begun is not None and begun.start == setup.reference_frame else None
-    return None if first is None else first.luma
 
 
 def measure(
@@ -160,7 +213,7 @@ def measure(
         helping = max(0, min(workers, len(chunks)) - 1)
         helpers = stack.enter_context(Helpers(measure_order, helping))
         reference = None if recording is None else store.reference(recording)
-        measurer = make_measurer(setup, reference, index, _reference_in(begun, setup))
+        measurer = make_measurer(setup, reference, index, begun)
         if recording is None:
             recording = store.begin(setup.method, setup.fingerprint, measurer.reference)
         eyes = pickle.dumps(Eyes(setup, index, measurer))

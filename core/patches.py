@@ -4,13 +4,14 @@ Every patch is matched against the *reference* frame, never against the frame be
 patch's predicted affine deformation (from the pose or homography) is applied to the reference, which is kept
 oversampled; the later frame's pixels are used as they are. So the noisy side is never interpolated, which keeps the
 estimate free of the half-pixel pull of an interpolated noise floor (Schreier & Sutton 2002), and light may change by a
-gain and an offset.
+gain and an offset. Where a single frame is too noisy to serve as the reference, the mean of several does.
 
 Source: Lucas & Kanade (1981); Baker & Matthews (2004) for the forward-additive form.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,7 @@ Singles = NDArray[np.float32]
 
 HALF_PX = 10  # patches of 21 x 21 pixels: 400 of them are 0.18 megapixel
 MARGIN_PX = 6  # room for deformation and for the interpolation kernel
+TILE_HALF_PX = HALF_PX + MARGIN_PX
 OVERSAMPLING = 2  # linear interpolation between half pixels errs below the noise of 8-bit video
 # A patch that takes more than a few steps shows something else.
 MAX_ITERATIONS = 4
@@ -34,6 +36,8 @@ STEP_GAIN = 0.87
 SETTLED_PX = 0.06
 # A patch that wanders further than this from its prediction has lost its own minimum.
 MAX_WANDER_PX = 5.0
+# Correlation below which a patch shows something else than in the reference frame.
+LEAST_SCORE = 0.6
 
 
 @dataclass(frozen=True)
@@ -55,24 +59,30 @@ class PatchTracker:
     Args:
         luma: the reference frame, (height, width).
         points_raw: (N, 2) patch centres; at least `HALF_PX + MARGIN_PX + 1` pixels inside the frame.
+
+    Attributes:
+        least_score: correlation below which a patch shows something else.
     """
 
     def __init__(self, luma: Luma, points_raw: Floats) -> None:
         self.points_raw = np.array(points_raw, dtype=np.float64).reshape(-1, 2)
+        self.least_score = LEAST_SCORE
         self._anchor = np.rint(self.points_raw).astype(np.int64)
-        self._tiles = _cut_out(luma, self._anchor - HALF_PX - MARGIN_PX, 2 * (HALF_PX + MARGIN_PX) + 1)
+        tiles = _cut_out(luma, self._anchor - TILE_HALF_PX, 2 * TILE_HALF_PX + 1)
+        self._tiles: tuple[NDArray[Any], ...] = (tiles,)
         self._lay_out()
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what the tiles say already: this travels to other processes."""
-        return {name: getattr(self, name) for name in ("points_raw", "_anchor", "_tiles")}
+        return {name: getattr(self, name) for name in ("points_raw", "least_score", "_anchor", "_tiles")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._lay_out()
 
     def _lay_out(self) -> None:
-        self._mosaic, self._tile_origin = _oversampled(self._tiles)
+        self._mosaics = [_oversampled(tiles) for tiles in self._tiles]
+        self._tile_origin = _tile_origins(len(self))
         side = np.arange(-HALF_PX - 1, HALF_PX + 2, dtype=np.float64)
         u, v = np.meshgrid(side, side)
         self._grid = np.stack([u.ravel(), v.ravel(), np.ones(u.size)]).astype(np.float32)
@@ -80,14 +90,56 @@ class PatchTracker:
     def __len__(self) -> int:
         return len(self.points_raw)
 
-    def track(self, luma: Luma, predicted_raw: Floats, ref_from_current: Floats) -> Matches:
+    @property
+    def is_averaged(self) -> bool:
+        """Whether the reference is a mean of noisy views."""
+        return len(self._tiles) > 1
+
+    def views(self, luma: Luma, raw: Floats, ref_from_current: Floats) -> Singles:
+        """Return the patches as another frame shows them, laid over the reference, (N, size, size); nan beyond it.
+
+        Args:
+            luma: the frame, (height, width).
+            raw: (N, 2) where the patches are in it.
+            ref_from_current: (N, 2, 2) as in `track`.
+        """
+        side = np.arange(-TILE_HALF_PX, TILE_HALF_PX + 1, dtype=np.float64)
+        grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+        offset = grid + (self._anchor - self.points_raw)[:, None]
+        places = raw[:, None] + offset @ np.linalg.inv(ref_from_current).transpose(0, 2, 1)
+        inside = ((places >= 0) & (places <= np.array(luma.shape[::-1]) - 1.0)).all(axis=(1, 2), keepdims=True)
+        maps = np.where(inside, places, 0.0).astype(np.float32)
+        sampled = cv2.remap(luma, maps[..., 0], maps[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+        tiles = sampled.reshape(-1, len(side), len(side)).astype(np.float32)
+        return np.where(inside, tiles, np.float32(np.nan))
+
+    def denoise(self, views: Sequence[Singles]) -> None:
+        """Look for means of what several frames show from now on, instead of what the reference frame shows.
+
+        Noise of the reference passes for fine texture, which makes steps too short: all patches alike would stay near
+        where they were predicted, and the camera with them. Frames whose own noise is in the mean of the first views
+        are compared with that of the others.
+
+        Args:
+            views: of the frames after the reference frame in turn; see `views`.
+        """
+        middle, reference = len(views) // 2, self._tiles[0].astype(np.float32)
+        likeness = np.nanmedian([_correlation(reference, view) for view in views])
+        # Two noisy views are as alike as the square of what a noisy one and one without noise are.
+        self.least_score = LEAST_SCORE * float(np.sqrt(np.clip(likeness, 0.0, 1.0)))
+        self._tiles = tuple(_mean_seen(part, reference) for part in ([reference, *views[:middle]], views[middle:]))
+        self._lay_out()
+
+    def track(self, luma: Luma, predicted_raw: Floats, ref_from_current: Floats, *, is_view: bool = False) -> Matches:
         """Find the patches in a frame.
 
         Args:
             luma: the frame, (height, width).
             predicted_raw: (N, 2) where they should be; a pixel or two of error is corrected.
             ref_from_current: (N, 2, 2) local affine deformation, reference pixels by frame pixels.
+            is_view: whether it is the reference frame or one of the first views, if those are averaged over.
         """
+        mosaic = self._mosaics[-1 if is_view else 0]
         raw, score = np.full((len(self), 2), np.nan), np.full(len(self), np.nan)
         corner = np.rint(np.where(np.isfinite(predicted_raw), predicted_raw, -1e6)).astype(np.int64) - HALF_PX
         size = 2 * HALF_PX + 1
@@ -96,14 +148,19 @@ class PatchTracker:
         if not len(index):
             return Matches(raw, score)
         pixels = _cut_out(luma, corner[index], size).astype(np.float32)
-        found, score[index] = self._align(index, pixels, predicted_raw[index], ref_from_current[index])
+        found, score[index] = self._align(mosaic, index, pixels, predicted_raw[index], ref_from_current[index])
         wandered = np.abs(found - predicted_raw[index]).max(axis=1) > MAX_WANDER_PX
         found[wandered], score[index[wandered]] = np.nan, np.nan
         raw[index] = found
         return Matches(raw, score)
 
     def _align(
-        self, index: NDArray[np.int64], pixels: Singles, predicted_raw: Floats, ref_from_current: Floats
+        self,
+        mosaic: Singles,
+        index: NDArray[np.int64],
+        pixels: Singles,
+        predicted_raw: Floats,
+        ref_from_current: Floats,
     ) -> tuple[Floats, Floats]:
         """Return positions (n, 2) by Gauss-Newton steps and the correlation (n,) before the last step."""
         centre = np.rint(predicted_raw)
@@ -115,7 +172,7 @@ class PatchTracker:
         energy = np.vecdot(frame, frame).astype(np.float64)
         for _ in range(MAX_ITERATIONS):
             offset, offset_ref = self._snapped(index[active], (centre - position)[active], ref_from_current[active])
-            template = self._template(index[active], offset_ref, ref_from_current[active])
+            template = self._template(mosaic, index[active], offset_ref, ref_from_current[active])
             step, score[active] = _step(frame, energy, template)
             position[active] = centre[active] - offset + step
             moving = (np.abs(step).max(axis=1) > SETTLED_PX) & (
@@ -138,37 +195,62 @@ class PatchTracker:
         within = place - self.points_raw[index] + self._anchor[index]
         return np.linalg.solve(ref_from_current, within[..., None])[..., 0], place
 
-    def _template(self, index: NDArray[np.int64], place: Floats, ref_from_current: Floats) -> Singles:
+    def _template(self, mosaic: Singles, index: NDArray[np.int64], place: Floats, ref_from_current: Floats) -> Singles:
         """Return the reference as the frame should show it, (n, size + 2, size + 2), around `place` (n, 2) of it."""
         coefficients = np.concatenate([ref_from_current, place[..., None]], axis=2)
         coefficients *= OVERSAMPLING
         coefficients[..., 2] += self._tile_origin[index]
         maps = coefficients.astype(np.float32) @ self._grid
         side = 2 * HALF_PX + 3
-        sampled = cv2.remap(self._mosaic, maps[:, 0], maps[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        sampled = cv2.remap(mosaic, maps[:, 0], maps[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(sampled, dtype=np.float32).reshape(len(index), side, side)
 
 
-def _oversampled(tiles: Luma) -> tuple[Singles, Floats]:
-    """Return one mosaic of oversampled tiles (N, size, size) and the mosaic coordinates (N, 2) of each one's centre."""
+def _oversampled(tiles: NDArray[Any]) -> Singles:
+    """Return one mosaic of oversampled tiles (N, size, size); see `_tile_origins`."""
     tile = tiles.shape[1] * OVERSAMPLING
-    columns = max(1, int(np.ceil(np.sqrt(len(tiles)))))
-    rows = max(1, -(-len(tiles) // columns))
+    rows, columns = _mosaic_shape(len(tiles))
     mosaic = np.zeros((rows * tile, columns * tile), dtype=np.float32)
-    origin = np.empty((len(tiles), 2))
     for number, patch in enumerate(tiles.astype(np.float32)):
         top, left = (number // columns) * tile, (number % columns) * tile
         large = cv2.resize(patch, (tile, tile), interpolation=cv2.INTER_LANCZOS4)
         mosaic[top : top + tile, left : left + tile] = large
-        # Pixel centres: enlarged index = OVERSAMPLING * (index + 1/2) - 1/2.
-        centre = OVERSAMPLING * (HALF_PX + MARGIN_PX + 0.5) - 0.5
-        origin[number] = left + centre, top + centre
-    return mosaic, origin
+    return mosaic
+
+
+def _mosaic_shape(count: int) -> tuple[int, int]:
+    columns = max(1, int(np.ceil(np.sqrt(count))))
+    return max(1, -(-count // columns)), columns
+
+
+def _tile_origins(count: int) -> Floats:
+    """Return the mosaic coordinates (N, 2), as u, v, of each tile's centre."""
+    tile, columns = (2 * TILE_HALF_PX + 1) * OVERSAMPLING, _mosaic_shape(count)[1]
+    number = np.arange(count)
+    corner = np.stack([number % columns, number // columns], axis=1) * tile
+    # Pixel centres: enlarged index = OVERSAMPLING * (index + 1/2) - 1/2.
+    return np.asarray(corner + OVERSAMPLING * (TILE_HALF_PX + 0.5) - 0.5)
+
+
+def _mean_seen(views: Sequence[Singles], otherwise: Singles) -> Singles:
+    """Return the mean (N, size, size) of views in which a tile is seen, or else another tile."""
+    stack = np.stack(views)
+    seen = np.isfinite(stack[:, :, 0, 0]).sum(axis=0)[:, None, None]
+    mean = np.nansum(stack, axis=0) / np.maximum(seen, 1)
+    return np.where(seen > 0, mean, otherwise).astype(np.float32)
 
 
 def _cut_out(luma: Luma, corner: NDArray[np.int64], size: int) -> Luma:
     windows = np.lib.stride_tricks.sliding_window_view(luma, (size, size))
     return windows[corner[:, 1], corner[:, 0]]
+
+
+def _correlation(left: Singles, right: Singles) -> Floats:
+    """Return the zero-mean normalised cross-correlation (N,) of patches on two tiles each (N, size, size)."""
+    within = slice(MARGIN_PX, -MARGIN_PX)
+    a, b = (tiles[:, within, within].reshape(len(tiles), -1) for tiles in (left, right))
+    a, b = (pixels - pixels.mean(axis=1, keepdims=True) for pixels in (a, b))
+    return _products(a, b) / np.sqrt(np.maximum(_products(a, a) * _products(b, b), 1e-9))
 
 
 def _step(frame: Singles, energy: Floats, template: Singles) -> tuple[Floats, Floats]:

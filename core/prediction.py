@@ -19,7 +19,7 @@ from core.project import Method, Target
 from core.storage import File, opened, state_of
 
 # Raised whenever the same video would be measured differently: older recordings are then not continued.
-MEASURE_VERSION = 3
+MEASURE_VERSION = 4
 # Bytes read at each of a video's places to tell it from another.
 SAMPLE_BYTES = 1 << 20
 

@@ -12,6 +12,7 @@ import os
 import queue
 import sys
 import threading
+from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -212,7 +213,8 @@ class FramesAhead:
         _give_pictures_back()
         self.start = start
         self._ahead: queue.Queue[Frame | Exception | None] = queue.Queue(maxsize=READ_AHEAD)
-        self._seen: list[Frame] = []
+        self._seen: deque[Frame] = deque()
+        self._ended = False
         self._stopped = threading.Event()
         threads = threads or min(MOST_THREADS, THREADS_PER_CORE * available_cores())
         frames = _decoded(path, start, stop, threads, index)
@@ -228,15 +230,18 @@ class FramesAhead:
         self._stopped.set()
         self._thread.join()
 
-    def first(self) -> Frame | None:
-        """Return the first frame before any is yielded, or None if there is none; it will be yielded all the same.
+    def peek(self) -> Iterator[Frame]:
+        """Yield the frames to come, all of which will be yielded all the same.
 
         Raises:
             InputError: as when they are yielded.
         """
-        if not self._seen:
-            self._seen = list(itertools.islice(self, 1))
-        return self._seen[0] if self._seen else None
+        for number in itertools.count():
+            if number == len(self._seen):
+                if (frame := self._next()) is None:
+                    return
+                self._seen.append(frame)
+            yield self._seen[number]
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames in order.
@@ -244,12 +249,15 @@ class FramesAhead:
         Raises:
             InputError: the file cannot be read, or `start` lies beyond its end.
         """
-        while self._seen:
-            yield self._seen.pop()
-        while (item := self._ahead.get()) is not None:
-            if isinstance(item, Exception):
-                raise item
-            yield item
+        while (frame := self._seen.popleft() if self._seen else self._next()) is not None:
+            yield frame
+
+    def _next(self) -> Frame | None:
+        item = None if self._ended else self._ahead.get()
+        self._ended = item is None or isinstance(item, Exception)
+        if isinstance(item, Exception):
+            raise item
+        return item
 
     def _decode(self, frames: Iterator[Frame]) -> None:
         try:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from core.coordinates import Floats
-from core.following import Apparent, LinesFollower, Scale
+from core.following import Apparent, LinesFollower, PointsFollower, Scale
+from core.ground import View
 from core.lens import Lens
 from core.video import Luma
 from tests.waves import frame, pixels, waves
@@ -60,3 +61,21 @@ def test_without_a_prediction_the_whole_picture_says_where_the_lines_are() -> No
     moved = np.roll(roof(), (12, -20), axis=(0, 1))
     found = follower().find(moved, np.eye(3), None, confirm=False)
     np.testing.assert_allclose(shift_px(found.apparent), [-20.0, 12.0], atol=0.5)
+
+
+def test_noisy_points_are_compared_with_a_mean_of_views() -> None:
+    texture, noise = waves(9, shortest_px=6.0, contrast=6.0), np.random.default_rng(4)
+
+    def seen(shift: tuple[float, float]) -> Luma:
+        return frame(texture(pixels(SIZE) - np.array(shift)) + noise.normal(scale=8.0, size=SIZE[::-1]))
+
+    region = LENS.rays_from_raw(np.array([[120.0, 90.0], [360.0, 90.0], [360.0, 270.0], [120.0, 270.0]]))
+    scale = Scale(rays_per_m=PX_PER_M / FOCAL_PX, pixels_per_m=PX_PER_M)
+    points = PointsFollower(seen((0.0, 0.0)), region, LENS, scale=scale, name="targets.roof")
+    unaware = points.find(seen((3.4, -2.2)), np.eye(3), Apparent(np.array([3.0, -2.0]) / FOCAL_PX, 0.0), confirm=False)
+    assert unaware.apparent is None
+    shifts = np.random.default_rng(5).uniform(-6.0, 6.0, (16, 2))
+    points.patches.denoise([points.views(View(seen(tuple(shift)), np.eye(3), 0.4)) for shift in shifts])
+    found = points.find(seen((3.4, -2.2)), np.eye(3), Apparent(np.array([3.0, -2.0]) / FOCAL_PX, 0.0), confirm=False)
+    np.testing.assert_allclose(shift_px(found.apparent), [3.4, -2.2], atol=0.1)
+    assert np.isfinite(found.raw).all(axis=1).mean() > 0.8

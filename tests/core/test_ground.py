@@ -208,6 +208,29 @@ def test_a_wrong_prediction_is_overcome() -> None:
     np.testing.assert_allclose(centre, apply_homography(true_homography(camera), np.zeros((1, 2))), atol=1e-3)
 
 
+def test_noise_is_no_obstacle_on_the_way_ahead() -> None:
+    noise = np.random.default_rng(3)
+
+    def noisy(camera: Pose) -> Luma:
+        return frame(120 + 0.2 * (seen(camera) - 120.0) + noise.normal(scale=14.0, size=SIZE[::-1]))
+
+    tracker = GroundTracker(noisy(pose()), features(), LENS, ground_mask(SIZE[::-1], REGIONS))
+    cameras = [pose((0.0, 0.0, 0.002 * n), (0.02 * n, 0.0, 0.0)) for n in range(1, 8)]
+    gone = frame(waves(77)(pixels(SIZE)))
+    views = list(tracker.look_ahead([noisy(camera) for camera in cameras] + [gone, noisy(cameras[0])]))
+    # As far as it is followed, and no further.
+    assert len(views) == len(cameras)
+    assert 0.2 < views[-1].score < 0.6
+    assert tracker.find(views[-1].luma, views[-1].H_ray_ray0) is None
+    corners = LENS.rays_from_raw(np.array([[20.0, 20.0], [460.0, 20.0], [460.0, 300.0], [20.0, 300.0]]))
+    moved = apply_homography(views[-1].H_ray_ray0, corners) - apply_homography(true_homography(cameras[-1]), corners)
+    assert np.abs(moved * 400).max() < 2.0
+    tracker.patches.denoise([tracker.views(view) for view in views[:-1]])
+    found = tracker.find(views[-1].luma, views[-2].H_ray_ray0)
+    assert found is not None
+    assert found.inliers > 0.7 * len(features())
+
+
 @pytest.mark.parametrize("grey", [np.full(SIZE[::-1], 128.0), waves(77)(pixels(SIZE))])
 def test_another_place_is_not_recognised(grey: Floats) -> None:
     assert ground_tracker().find(frame(grey), None) is None

@@ -126,3 +126,46 @@ def test_no_patches_at_all_and_none_inside() -> None:
     assert len(PatchTracker(luma, np.empty((0, 2)))) == 0
     found = tracker().track(luma, np.full((40, 2), np.nan), np.broadcast_to(STILL, (40, 2, 2)).copy())
     assert np.isnan(found.raw).all()
+
+
+def test_a_noisy_reference_is_averaged_over_views_of_it() -> None:
+    faint, noise, still = waves(5, contrast=3.0), 7.0, np.broadcast_to(STILL, (40, 2, 2))
+    alone, averaged = (PatchTracker(frame(faint(pixels(SIZE)), noise, seed=1), points()) for _ in range(2))
+    shifts = np.random.default_rng(2).uniform(-1.5, 1.5, (32, 2))
+    lumas = [frame(faint(pixels(SIZE) - shift), noise, seed=10 + n) for n, shift in enumerate(shifts)]
+    averaged.denoise([averaged.views(luma, points() + s, still) for luma, s in zip(lumas, shifts, strict=True)])
+    assert 0.3 * alone.least_score < averaged.least_score < 0.6 * alone.least_score
+
+    def errors(tracker: PatchTracker) -> Floats:
+        predicted = points() + [0.37 + 0.6, 0.0]
+        later = [frame(faint(pixels(SIZE) - [0.37, 0.0]), noise, seed=100 + n) for n in range(6)]
+        return np.array([tracker.track(luma, predicted, still).raw - points() - [0.37, 0.0] for luma in later])
+
+    # Compared with one noisy frame, all patches stay behind on the way from where they were predicted.
+    assert np.nanmedian(errors(alone)[..., 0]) > 0.1
+    assert abs(np.nanmedian(errors(averaged)[..., 0])) < 0.04
+    # What is left is the noise of the frame itself, whatever direction it has.
+    assert np.nanmedian(np.abs(errors(averaged)[..., 1])) < 0.65 * np.nanmedian(np.abs(errors(alone)[..., 1]))
+
+
+def test_a_frame_is_not_compared_with_its_own_noise() -> None:
+    faint, still = waves(5, contrast=6.0), np.broadcast_to(STILL, (40, 2, 2))
+    lumas = [frame(faint(pixels(SIZE)), 7.0, seed=n) for n in range(9)]
+    patches = PatchTracker(lumas[0], points())
+    patches.denoise([patches.views(luma, points(), still) for luma in lumas[1:]])
+    scatter = [
+        np.nanstd(patches.track(lumas[2], points(), still, is_view=is_view).raw - points()) for is_view in (False, True)
+    ]
+    assert scatter[0] < 0.7 * scatter[1]
+
+
+def test_what_views_do_not_show_stays_as_the_reference_frame_shows_it() -> None:
+    patches, still = tracker(), np.broadcast_to(STILL, (40, 2, 2))
+    beside = np.where(np.arange(40)[:, None] < 20, points(), np.nan)
+    beside[19] = 2.0, 2.0
+    views = patches.views(frame(TEXTURE(pixels(SIZE)), 3.0, seed=3), beside, still)
+    assert np.isfinite(views[:19]).all()
+    assert np.isnan(views[19:]).all()
+    patches.denoise([views] * 8)
+    found = patches.track(frame(TEXTURE(pixels(SIZE))), points(), still)
+    assert np.abs(found.raw - points())[20:].max() < 0.02

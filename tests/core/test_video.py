@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import threading
 from fractions import Fraction
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from core.errors import InputError
-from core.video import Luma, frame_index, probe, read_frame, read_frame_rgb, read_frames, read_frames_rgb
+from core.video import FramesAhead, Luma, frame_index, probe, read_frame, read_frame_rgb, read_frames, read_frames_rgb
 
 SIZE = (96, 64)
 FRAMES = 50
@@ -229,6 +230,15 @@ def test_a_file_cut_off_gives_what_came_before(tmp_path: Path) -> None:
     frames = list(read_frames(cut))
     assert 10 < len(frames) < FRAMES
     assert [number_of(frame.luma) for frame in frames[:10]] == list(range(10))
+
+
+def test_frames_looked_at_before_they_are_taken_are_taken_all_the_same(video: Path) -> None:
+    with FramesAhead(video, 3, 6) as frames:
+        assert [frame.index for frame in itertools.islice(frames.peek(), 2)] == [3, 4]
+        assert [frame.index for frame in frames.peek()] == [3, 4, 5]
+        taken = [(frame.index, number_of(frame.luma)) for frame in frames]
+        assert taken == [(3, 3), (4, 4), (5, 5)]
+        assert list(frames.peek()) == list(frames) == []
 
 
 def test_who_stops_reading_leaves_no_thread_behind(video: Path) -> None:

@@ -151,6 +151,24 @@ def test_the_published_way_shows_the_exact_apparent_motion(clip, tmp_path):
     assert np.sqrt(np.nanmean(error**2, axis=0)).max() < 0.2 * roof_pixel_m(BRIEF)
 
 
+def test_a_noisy_clip_is_compared_with_a_mean_of_frames(tmp_path_factory, tmp_path):
+    brief = replace(BRIEF, texture=0.3, noise=(8.0, 0.0), recording=Recording(bit_rate=10_000_000))
+    clip = rendered(tmp_path_factory, "noisy", brief)
+    alone, shared = (project_copy(clip, tmp_path / name) for name in ("alone", "shared"))
+    for folder in (alone, shared):
+        (folder / "results").mkdir()
+    history = measured_history(alone)
+    true = np.stack([truth(clip)["roof_p1_m"], truth(clip)["roof_p2_m"]], axis=1)
+    start, end = read_project(clip).intervals_s.pre_event
+    rest = (history.time_s >= start) & (history.time_s <= end)
+    error = displacement(history) - (true - true[rest].mean(axis=0))
+    assert np.isfinite(error).all()
+    # By its reference frame alone the clip is measured to one and a half pixels.
+    assert np.sqrt((error**2).mean()) < 0.25 * roof_pixel_m(brief)
+    # Two workers, one of which begins in the middle, average over the same views: a fortieth of what noise makes.
+    assert largest_difference_m(history, measured_history(shared, workers=2)) < 1e-4
+
+
 def test_a_clip_that_starts_in_mid_shaking_finds_its_own_lines(tmp_path_factory):
     brief = replace(BRIEF, starts_s=3.0, recording=Recording(bit_rate=8_000_000))
     folder = rendered(tmp_path_factory, "mid-shaking", brief)
