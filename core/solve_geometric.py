@@ -21,7 +21,7 @@ from core.ground_poses import fit_with_relief, solve_ground
 from core.intervals import during
 from core.lens import Lens
 from core.measurements import Recording
-from core.motion import RigidFit, is_determined_as_usual
+from core.motion import RigidFit, is_determined, is_determined_as_usual
 from core.project import Project, Target
 from core.relief import Relief
 from core.results import Status, TargetHistory
@@ -157,7 +157,9 @@ def _solve_target(
     still = during(recording.time_s, project.intervals_s.pre_event)
     fit = body.fit(points, still & ground.usable)
     used_points = (fit.weight > 0.1).reshape(len(fit.weight), -1).sum(axis=1)
-    status = frame_status(recording, project, ground, used_points, is_determined_as_usual(fit.normal))
+    # That the points of a textured roof scatter more than usual is no weakness: their standard deviation says it.
+    determined = is_determined(fit.normal) if body.lines is None else is_determined_as_usual(fit.normal)
+    status = frame_status(recording, project, ground, used_points, determined)
     apparent = world_points(midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, 0.0)
     flat = rest_body(recording, target.name, used.lens, used.pose0, 0.0)
     raw = flat.fit(apparent, np.zeros(len(apparent), dtype=bool))

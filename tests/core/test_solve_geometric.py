@@ -82,6 +82,24 @@ def test_residual_displacement_stays() -> None:
     np.testing.assert_allclose(rest, [scene.RESIDUAL_M, 0.0], atol=1.5e-3)
 
 
+def test_a_textured_roof_seen_roughly_is_measured_with_a_larger_standard_deviation() -> None:
+    lines = scene.recording(0.02)
+    patches = lines.targets_raw["roof"].reshape(scene.FRAMES, -1, 2)
+    rough = 60
+    noise = np.random.default_rng(7).normal(scale=0.2, size=patches.shape[1:])
+    patches = patches + np.where(np.arange(scene.FRAMES) == rough, 1.0, 0.0)[:, None, None] * noise
+    reference = replace(lines.reference, targets_raw={"roof": lines.reference.targets_raw["roof"].reshape(-1, 2)})
+    corners = [(-3.0, -2.0), (3.0, -2.0), (3.0, 2.0), (-3.0, 2.0)]
+    region = [tuple(np.array(corner) + scene.ROOF_M + scene.SITE_M) for corner in corners]
+    target = {"name": "roof", "kind": "points", "height_m": scene.HEIGHT_M, "region_m": region}
+    recording = replace(lines, reference=reference, targets_raw={"roof": patches})
+    history = solved(recording, targets=[target]).histories["roof"]
+    assert (history.status == Status.OK).all()
+    usual = np.median(history.p1_sigma_m, axis=0)
+    assert (history.p1_sigma_m[rough] > 2.0 * usual).all()
+    assert (np.abs(history.p1_m[rough] - scene.truth().p1_m[rough]) < 4.0 * history.p1_sigma_m[rough] + 1e-3).all()
+
+
 # --- steady features count more --------------------------------------------------------------------------------------
 
 
