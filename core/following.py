@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.coordinates import Floats, apply_homography, finite_rows
-from core.ground import ALIKE_SCORE, View, choose_features_within, homography_jacobian
+from core.ground import ALIKE_SCORE, NOISY_ROUNDS, View, choose_features_within, homography_jacobian
 from core.lens import Lens
 from core.motion import LineSet, RigidFit, fit_line, is_determined, rigid_from_points, rough_rigid_from_lines
 from core.patches import PatchTracker, Singles
@@ -38,8 +38,6 @@ CONFIRM_EVERY = 15
 # Another place than where strips were found must show this part of them at least.
 AS_WELL = 0.8
 POINTS = 160
-# Patches of two noisy frames stay near where they are looked for: so many times they are looked for where they were.
-VIEW_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -219,7 +217,7 @@ class PointsFollower:
         """Return the patches as a view shows them; see `PatchTracker.views`."""
         seen = self._finder.search(view.luma, view.H_ray_ray0)
         apparent = None if seen is None else Apparent(seen, 0.0)
-        for _ in range(VIEW_ROUNDS):
+        for _ in range(1 + NOISY_ROUNDS):
             if apparent is not None:
                 apparent = self._measure(view.luma, view.H_ray_ray0, apparent, least_score=ALIKE_SCORE).apparent
         raw, ref_from_current = self._expected(view.H_ray_ray0, apparent or Apparent.none())
@@ -231,15 +229,20 @@ class PointsFollower:
         """Return the patches in a frame; see `Follower.find`."""
         found = self._measure(luma, H_ray_ray0, predicted, is_view=is_view) if predicted is not None else None
         if found is not None and found.apparent is not None:
-            # As for the ground: in noise, patches stay near where they are looked for.
-            again = self.patches.is_averaged
-            return self._measure(luma, H_ray_ray0, found.apparent, is_view=is_view) if again else found
+            return self._settled(luma, H_ray_ray0, found, is_view=is_view) if self.patches.is_averaged else found
         seen = self._finder.search(luma, H_ray_ray0)
         if seen is None:
             return TargetMatch(np.full_like(self.reference_raw, np.nan), None)
         rotation = predicted.rotation_rad if predicted is not None else 0.0
         coarse = self._measure(luma, H_ray_ray0, Apparent(seen, rotation), is_view=is_view)
         return coarse if coarse.apparent is None else self._measure(luma, H_ray_ray0, coarse.apparent, is_view=is_view)
+
+    def _settled(self, luma: Luma, H_ray_ray0: Floats, found: TargetMatch, *, is_view: bool) -> TargetMatch:
+        """Return the patches looked for where noisy ones have been found; as `GroundTracker.find` does."""
+        for _ in range(NOISY_ROUNDS):
+            if found.apparent is not None:
+                found = self._measure(luma, H_ray_ray0, found.apparent, is_view=is_view)
+        return found
 
     def _measure(
         self,

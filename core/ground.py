@@ -27,6 +27,9 @@ FEATURES = 180
 JUDGED_BY = 12
 CLEAN_SCORE = 0.96
 ALIKE_SCORE = 0.2
+# In noise patches stay near where they are looked for: so many times they are looked for where they have been found, so
+# that nothing is left of the prediction and a chunk measured by itself equals an uninterrupted pass.
+NOISY_ROUNDS = 2
 # Frames after the reference frame over which a noisy reference is averaged, and the fewest that do.
 VIEWS = 64
 LEAST_VIEWS = 8
@@ -215,9 +218,9 @@ class GroundTracker:
         expected = np.eye(3) if predicted_H_ray_ray0 is None else predicted_H_ray_ray0
         found = self._refine(luma, expected, is_view=is_view)
         if found is not None and found.inliers >= max(LEAST_POINTS, len(self.patches) // 4):
-            # In noise patches stay near where they are looked for: let that be where this very frame shows them.
-            again = self._refine(luma, found.H_ray_ray0, is_view=is_view) if self.patches.is_averaged else None
-            return again or found
+            for _ in range(NOISY_ROUNDS if self.patches.is_averaged else 0):
+                found = self._refine(luma, found.H_ray_ray0, is_view=is_view) or found
+            return found
         searched = self._finder.search(luma)
         if searched is None:
             return None

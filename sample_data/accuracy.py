@@ -79,6 +79,7 @@ USUAL_SCENES = (
     "two_targets",
     "rolling_shutter",
     "dusk",
+    "night",
     "variable_rate",
 )
 PAPER_SCENES = ("eq5_slow_drift", "eq7_slow_drift")

@@ -313,6 +313,8 @@ SCENES: dict[str, Brief] = {
     "cloud_shadow": Brief(look=10, extras=(happenings.cloud_shadow,)),
     # Late light: a long exposure smears the moving roof over several pixels, and little light means noise.
     "dusk": Brief(look=25, sensor=Sensor(exposure_s=1 / 60), noise=(3.0, 0.06), peak_m=0.6),
+    # Hardly any light at all: a reference frame that is half noise, which patches must not be compared with as it is.
+    "night": replace(_FULL_HD, look=26, texture=0.5, noise=(8.0, 0.0), recording=Recording(bit_rate=20_000_000)),
     "flicker": Brief(look=11, extras=(happenings.flicker,)),
     "hidden_line": Brief(look=12, extras=(happenings.hidden_line,)),
     "gust": Brief(look=13, extras=(happenings.gust,), margin_m=9.0),

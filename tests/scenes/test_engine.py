@@ -165,8 +165,7 @@ def test_a_noisy_clip_is_compared_with_a_mean_of_frames(tmp_path_factory, tmp_pa
     assert np.isfinite(error).all()
     # By its reference frame alone the clip is measured to one and a half pixels.
     assert np.sqrt((error**2).mean()) < 0.25 * roof_pixel_m(brief)
-    # Two workers, one of which begins in the middle, average over the same views: a fortieth of what noise makes.
-    assert largest_difference_m(history, measured_history(shared, workers=2)) < 1e-4
+    assert largest_difference_m(history, measured_history(shared, workers=2)) < SAME_M
 
 
 def test_a_clip_that_starts_in_mid_shaking_finds_its_own_lines(tmp_path_factory):
