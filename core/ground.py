@@ -32,7 +32,7 @@ ALIKE_SCORE = 0.2
 NOISY_ROUNDS = 2
 # Frames after the reference frame over which a noisy reference is averaged, and the fewest that do.
 VIEWS = 64
-LEAST_VIEWS = 8
+LEAST_VIEWS = 12
 # Ground points needed before a frame's homography is believed.
 LEAST_POINTS = 12
 # Widths of the reduced pictures in which features are chosen and a lost camera is found again, pixels.

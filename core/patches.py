@@ -38,6 +38,8 @@ SETTLED_PX = 0.06
 MAX_WANDER_PX = 5.0
 # Correlation below which a patch shows something else than in the reference frame.
 LEAST_SCORE = 0.6
+# An encoder copies some of a frame's noise into its neighbours: so many views lie between two means in neither of them.
+VIEWS_BETWEEN = 4
 
 
 @dataclass(frozen=True)
@@ -117,17 +119,18 @@ class PatchTracker:
         """Look for means of what several frames show from now on, instead of what the reference frame shows.
 
         Noise of the reference passes for fine texture, which makes steps too short: all patches alike would stay near
-        where they were predicted, and the camera with them. Frames whose own noise is in the mean of the first views
-        are compared with that of the others.
+        where they were predicted, and the camera with them. Frames of the first half of the views, whose own noise is
+        in their mean, are compared with that of the others.
 
         Args:
             views: of the frames after the reference frame in turn; see `views`.
         """
         middle, reference = len(views) // 2, self._tiles[0].astype(np.float32)
+        first, second = [reference, *views[: middle - VIEWS_BETWEEN // 2]], views[middle + VIEWS_BETWEEN // 2 :]
         likeness = np.nanmedian([_correlation(reference, view) for view in views])
         # Two noisy views are as alike as the square of what a noisy one and one without noise are.
         self.least_score = LEAST_SCORE * float(np.sqrt(np.clip(likeness, 0.0, 1.0)))
-        self._tiles = tuple(_mean_seen(part, reference) for part in ([reference, *views[:middle]], views[middle:]))
+        self._tiles = _mean_seen(first, reference), _mean_seen(second, reference)
         self._lay_out()
 
     def track(self, luma: Luma, predicted_raw: Floats, ref_from_current: Floats, *, is_view: bool = False) -> Matches:
@@ -137,7 +140,7 @@ class PatchTracker:
             luma: the frame, (height, width).
             predicted_raw: (N, 2) where they should be; a pixel or two of error is corrected.
             ref_from_current: (N, 2, 2) local affine deformation, reference pixels by frame pixels.
-            is_view: whether it is the reference frame or one of the first views, if those are averaged over.
+            is_view: whether it is the reference frame or of the first half of the views, if those are averaged over.
         """
         mosaic = self._mosaics[-1 if is_view else 0]
         raw, score = np.full((len(self), 2), np.nan), np.full(len(self), np.nan)

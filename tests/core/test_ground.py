@@ -215,7 +215,7 @@ def test_noise_is_no_obstacle_on_the_way_ahead() -> None:
         return frame(120 + 0.2 * (seen(camera) - 120.0) + noise.normal(scale=14.0, size=SIZE[::-1]))
 
     tracker = GroundTracker(noisy(pose()), features(), LENS, ground_mask(SIZE[::-1], REGIONS))
-    cameras = [pose((0.0, 0.0, 0.002 * n), (0.02 * n, 0.0, 0.0)) for n in range(1, 8)]
+    cameras = [pose((0.0, 0.0, 0.002 * n), (0.02 * n, 0.0, 0.0)) for n in range(1, 16)]
     gone = frame(waves(77)(pixels(SIZE)))
     views = list(tracker.look_ahead([noisy(camera) for camera in cameras] + [gone, noisy(cameras[0])]))
     # As far as it is followed, and no further.
