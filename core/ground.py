@@ -26,7 +26,7 @@ FEATURES = 180
 # the second, it is too noisy to go by itself. Two noisy views are alike by more than chance from the third on.
 JUDGED_BY = 12
 CLEAN_SCORE = 0.96
-ALIKE_SCORE = 0.2
+ALIKE_SCORE = 0.15
 # In noise patches stay near where they are looked for: so many times they are looked for where they have been found, so
 # that nothing is left of the prediction and a chunk measured by itself equals an uninterrupted pass.
 NOISY_ROUNDS = 2
@@ -196,10 +196,11 @@ class GroundTracker:
         H = np.eye(3)
         for luma in lumas:
             found = self._refine(luma, H, least_score=ALIKE_SCORE)
-            if found is None:
+            usual = float(np.nanmedian(found.matches.score)) if found is not None else 0.0
+            if found is None or usual < ALIKE_SCORE:
                 return
             H = found.H_ray_ray0
-            yield View(luma, H, float(np.nanmedian(found.matches.score)))
+            yield View(luma, H, usual)
 
     def views(self, view: View) -> Singles:
         """Return the patches as a view shows them; see `PatchTracker.views`."""
