@@ -30,14 +30,13 @@ from core.results import (
     CSV_HEADER,
     TargetHistory,
     displacement_at,
-    relative_history,
     summarise,
     write_history_csv,
     write_summary,
 )
 from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution
-from core.solve import filtered
+from core.solve import filtered, unfiltered_history
 from core.storage import File
 from core.validation import GpsComparison, GpsRecord, compare_with_gps
 from core.video import read_frame
@@ -182,22 +181,13 @@ def _drift_warnings(results: Results, target: Target, history: TargetHistory) ->
     drift = results.project.drift
     if drift.filter == "none" or not history.measured.any():
         return []
-    before = unfiltered_history(results.solution, target)
+    before = unfiltered_history(results.solution, target, results.project.intervals_s)
     return [
         f"{target.name}: {sentence}"
         for sentence in filter_warnings(
             before.p1_m, history.p1_m, history.time_s, results.project.intervals_s, corner_hz=drift.corner_hz
         )
     ]
-
-
-def unfiltered_history(solution: Solution, target: Target) -> TargetHistory:
-    """Return a target's displacement before any filter, relative to another target where it is told so."""
-    solved = solution.targets[target.name]
-    if target.relative_to is None:
-        return solved.history
-    base = solution.targets[target.relative_to]
-    return relative_history(solved.history, base.history, rest_m=solved.rest_m, base_rest_m=base.rest_m)
 
 
 def _gps_warnings(project: Project, check: GpsCheck) -> list[str]:

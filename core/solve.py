@@ -5,20 +5,21 @@ One word chooses the method; relative motion and the high-pass filter are the sa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from core.drift import high_pass
+from core.intervals import during
 from core.lens import Lens
 from core.measurements import Recording
-from core.project import Drift, Project
+from core.project import Drift, Intervals, Project, Target
 from core.relief import Relief
 from core.results import TargetHistory, relative_history
-from core.solution import Solution, TargetSolution
+from core.solution import Solution
 from core.solve_geometric import solve_geometric
 from core.solve_paper import solve_paper
+from core.uncertainty import held_to_scatter
 
 
 def solve(
@@ -38,24 +39,23 @@ def solve(
         solution = solve_paper(recording, project, lens, relief, has_lens=has_lens)
     else:
         solution = solve_geometric(recording, project, lens, relief)
-    histories = _relative(dict(solution.histories), solution.targets, project)
-    return replace(solution, histories={name: filtered(history, project.drift) for name, history in histories.items()})
+    return replace(
+        solution,
+        histories={
+            target.name: filtered(unfiltered_history(solution, target, project.intervals_s), project.drift)
+            for target in project.targets
+        },
+    )
 
 
-def _relative(
-    histories: dict[str, TargetHistory], targets: Mapping[str, TargetSolution], project: Project
-) -> dict[str, TargetHistory]:
-    result = dict(histories)
-    for target in project.targets:
-        if target.relative_to is not None:
-            base = target.relative_to
-            result[target.name] = relative_history(
-                histories[target.name],
-                histories[base],
-                rest_m=targets[target.name].rest_m,
-                base_rest_m=targets[base].rest_m,
-            )
-    return result
+def unfiltered_history(solution: Solution, target: Target, intervals: Intervals) -> TargetHistory:
+    """Return a target's displacement before any filter, relative to another target where it is told so."""
+    solved = solution.targets[target.name]
+    if target.relative_to is None:
+        return solved.history
+    base = solution.targets[target.relative_to]
+    relative = relative_history(solved.history, base.history, rest_m=solved.rest_m, base_rest_m=base.rest_m)
+    return held_to_scatter(relative, during(relative.time_s, intervals.pre_event))
 
 
 def filtered(history: TargetHistory, drift: Drift) -> TargetHistory:

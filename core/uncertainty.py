@@ -6,12 +6,13 @@ off the stationary part, where every departure is error.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from core.coordinates import Bools, Floats, finite_median
+from core.results import TargetHistory
 
 # What the ground errs by as a whole, as part of its features' scatter (measured on H.264 clips with exact truth).
 GROUND_PART = 0.05
@@ -101,3 +102,28 @@ def combined_sigma(
     wider = np.where(moving, MOVING, 1.0)
     places_sigma = np.sqrt((random * factor) ** 2 + slow_m**2)
     return Sigma(places_sigma * wider[:, None, None], points.rotation_rad * rotation_factor * wider)
+
+
+def held_to_scatter(relative: TargetHistory, still: Bools) -> TargetHistory:
+    """Return relative motion with standard deviations no larger than what it scatters by at rest says.
+
+    Added as if independent, the errors of target and base make too much of what both share, the camera first of all.
+
+    Args:
+        relative: of a target against another.
+        still: (F,) frames of the stationary part.
+    """
+    still = still & relative.measured
+    if still.sum() < LEAST_STILL:
+        return relative
+
+    def held(sigma: Floats, value: Floats) -> Floats:
+        usual = np.sqrt((sigma[still] ** 2).mean(axis=0))
+        return np.asarray(sigma * np.clip(value[still].std(axis=0) / usual, LEAST_FACTOR, 1.0))
+
+    return replace(
+        relative,
+        p1_sigma_m=held(relative.p1_sigma_m, relative.p1_m),
+        p2_sigma_m=held(relative.p2_sigma_m, relative.p2_m),
+        rotation_sigma_rad=held(relative.rotation_sigma_rad, relative.rotation_rad),
+    )

@@ -17,9 +17,9 @@ from app.store import ProjectFolder
 from core.coordinates import Floats
 from core.drift import amplitude_spectrum, corner_sweep, filter_warnings, high_pass
 from core.errors import InputError
-from core.export import unfiltered_history
 from core.project import Drift, Positive
 from core.results import TargetHistory
+from core.solve import unfiltered_history
 
 router = APIRouter(prefix="/api/projects/{project_id}")
 
@@ -96,7 +96,8 @@ def _steady(here: Context, folder: ProjectFolder, wanted: Filter) -> Floats | No
         history = here.outcomes.history(folder, project, wanted.target, "geometric")
     else:
         target = next(target for target in project.targets if target.name == wanted.target)
-        history = unfiltered_history(here.outcomes.solved(folder, project, "geometric").solution, target)
+        solution = here.outcomes.solved(folder, project, "geometric").solution
+        history = unfiltered_history(solution, target, project.intervals_s)
     return history.p1_m if wanted.point == "p1" else history.p2_m
 
 

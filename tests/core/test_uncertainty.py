@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from core.coordinates import Floats
-from core.uncertainty import LEAST_STILL, MOVING, Sigma, combined_sigma, common_error
+from core.results import TargetHistory
+from core.uncertainty import LEAST_STILL, MOVING, Sigma, combined_sigma, common_error, held_to_scatter
 
 FRAMES = 400
 STILL = np.arange(FRAMES) < 150
@@ -62,3 +63,29 @@ def test_a_target_whose_pieces_wander_errs_as_a_whole() -> None:
     wandering[~MOVING_FRAMES] *= 0.3
     error = common_error(own + wandering, time_s, STILL)
     assert np.median(error[170:280]) > 1.8 * np.median(error[:130])
+
+
+def test_what_target_and_base_share_is_no_error_of_their_difference() -> None:
+    random = np.random.default_rng(4)
+    places = random.normal(scale=[4e-4, 1e-4], size=(FRAMES, 2))
+    relative = TargetHistory(
+        name="storey",
+        frame=np.arange(FRAMES),
+        time_s=np.arange(FRAMES) / 30,
+        status=np.where(np.arange(FRAMES) == 7, "lost", "ok"),
+        p1_m=places,
+        p2_m=places + 1.0,
+        rotation_rad=places[:, 0],
+        p1_sigma_m=np.full((FRAMES, 2), 3e-4),
+        p2_sigma_m=np.full((FRAMES, 2), 3e-4),
+        rotation_sigma_rad=np.full(FRAMES, 3e-4),
+        p1_raw_m=places,
+        p2_raw_m=places,
+        rotation_raw_rad=places[:, 0],
+    )
+    held = held_to_scatter(relative, STILL)
+    # Too small a standard deviation stays: something else than what is shared is at work.
+    np.testing.assert_allclose(held.p1_sigma_m[STILL & held.measured, 0], 3e-4)
+    np.testing.assert_allclose(held.p2_sigma_m[held.measured, 1], 1e-4, rtol=0.2)
+    np.testing.assert_allclose(held.rotation_sigma_rad[held.measured], 3e-4)
+    assert held_to_scatter(relative, np.arange(FRAMES) < LEAST_STILL - 1) is relative
