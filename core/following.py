@@ -215,13 +215,15 @@ class PointsFollower:
 
     def views(self, view: View) -> Singles:
         """Return the patches as a view shows them; see `PatchTracker.views`."""
+        found = TargetMatch(np.full_like(self.reference_raw, np.nan), None)
         seen = self._finder.search(view.luma, view.H_ray_ray0)
-        apparent = None if seen is None else Apparent(seen, 0.0)
-        for _ in range(1 + NOISY_ROUNDS):
-            if apparent is not None:
-                apparent = self._measure(view.luma, view.H_ray_ray0, apparent, least_score=ALIKE_SCORE).apparent
-        raw, ref_from_current = self._expected(view.H_ray_ray0, apparent or Apparent.none())
-        return self.patches.views(view.luma, np.full_like(raw, np.nan) if apparent is None else raw, ref_from_current)
+        if seen is not None:
+            found = self._measure(view.luma, view.H_ray_ray0, Apparent(seen, 0.0), least_score=ALIKE_SCORE)
+            found = self._settled(view.luma, view.H_ray_ray0, found, NOISY_ROUNDS, least_score=ALIKE_SCORE)
+        raw, ref_from_current = self._expected(view.H_ray_ray0, found.apparent or Apparent.none())
+        if found.apparent is None:
+            raw = np.full_like(raw, np.nan)
+        return self.patches.views(view.luma, raw, ref_from_current)
 
     def find(
         self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool, is_view: bool = False
@@ -229,19 +231,29 @@ class PointsFollower:
         """Return the patches in a frame; see `Follower.find`."""
         found = self._measure(luma, H_ray_ray0, predicted, is_view=is_view) if predicted is not None else None
         if found is not None and found.apparent is not None:
-            return self._settled(luma, H_ray_ray0, found, is_view=is_view) if self.patches.is_averaged else found
+            rounds = NOISY_ROUNDS if self.patches.is_averaged else 0
+            return self._settled(luma, H_ray_ray0, found, rounds, is_view=is_view)
         seen = self._finder.search(luma, H_ray_ray0)
         if seen is None:
             return TargetMatch(np.full_like(self.reference_raw, np.nan), None)
         rotation = predicted.rotation_rad if predicted is not None else 0.0
         coarse = self._measure(luma, H_ray_ray0, Apparent(seen, rotation), is_view=is_view)
-        return coarse if coarse.apparent is None else self._measure(luma, H_ray_ray0, coarse.apparent, is_view=is_view)
+        return self._settled(luma, H_ray_ray0, coarse, 1, is_view=is_view)
 
-    def _settled(self, luma: Luma, H_ray_ray0: Floats, found: TargetMatch, *, is_view: bool) -> TargetMatch:
-        """Return the patches looked for where noisy ones have been found; as `GroundTracker.find` does."""
-        for _ in range(NOISY_ROUNDS):
+    def _settled(
+        self,
+        luma: Luma,
+        H_ray_ray0: Floats,
+        found: TargetMatch,
+        rounds: int,
+        *,
+        least_score: float | None = None,
+        is_view: bool = False,
+    ) -> TargetMatch:
+        """Return the patches looked for so many times more, each time where they have been found."""
+        for _ in range(rounds):
             if found.apparent is not None:
-                found = self._measure(luma, H_ray_ray0, found.apparent, is_view=is_view)
+                found = self._measure(luma, H_ray_ray0, found.apparent, least_score=least_score, is_view=is_view)
         return found
 
     def _measure(

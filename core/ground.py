@@ -22,17 +22,11 @@ from core.video import Luma
 
 # More give no better pose: what compression gets wrong, it gets wrong for all of them alike.
 FEATURES = 180
-# So many frames after the reference frame an encoder no longer repeats it; where they correlate with it by less than
-# the second, it is too noisy to go by itself. Two noisy views are alike by more than chance from the third on.
-JUDGED_BY = 12
-CLEAN_SCORE = 0.96
+# Correlation from which two noisy views are alike by more than chance.
 ALIKE_SCORE = 0.15
 # In noise patches stay near where they are looked for: so many times they are looked for where they have been found, so
 # that nothing is left of the prediction and a chunk measured by itself equals an uninterrupted pass.
 NOISY_ROUNDS = 2
-# Frames after the reference frame over which a noisy reference is averaged, and the fewest that do.
-VIEWS = 64
-LEAST_VIEWS = 12
 # Ground points needed before a frame's homography is believed.
 LEAST_POINTS = 12
 # Widths of the reduced pictures in which features are chosen and a lost camera is found again, pixels.

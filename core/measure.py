@@ -21,23 +21,21 @@ from core.chunks import HEAD_START, WARM_UP, Chunk, missing_chunks
 from core.cluster import Cluster
 from core.errors import InputError
 from core.following import CONFIRM_EVERY, PointsFollower, make_follower
-from core.ground import (
-    CLEAN_SCORE,
-    FEATURES,
-    JUDGED_BY,
-    LEAST_VIEWS,
-    VIEWS,
-    GroundTracker,
-    View,
-    choose_features,
-    ground_mask,
-)
+from core.ground import FEATURES, GroundTracker, View, choose_features, ground_mask
 from core.measurements import FrameMeasurement, MeasurementStore, Reference
 from core.patches import PatchTracker, Singles
 from core.prediction import MeasureSetup, nothing_measured, predict_apparent, predict_homography
 from core.progress import CancelToken, Progress, silent
 from core.video import FrameIndex, FramesAhead, Luma, available_cores, frame_index, read_frames
 from core.workers import Helpers, Order
+
+# So many frames after the reference frame an encoder no longer repeats it; where they correlate with it by less than
+# this, it is too noisy to go by itself.
+JUDGED_BY = 12
+CLEAN_SCORE = 0.96
+# Frames after the reference frame over which a noisy reference is averaged, and the fewest that do.
+VIEWS = 64
+LEAST_VIEWS = 12
 
 
 class Measurer(Protocol):

@@ -83,8 +83,10 @@ class PatchTracker:
         self._lay_out()
 
     def _lay_out(self) -> None:
-        self._mosaics = [_oversampled(tiles) for tiles in self._tiles]
-        self._tile_origin = _tile_origins(len(self))
+        corner = _tile_corners(len(self))
+        self._mosaics = [_oversampled(tiles, corner) for tiles in self._tiles]
+        # Pixel centres: enlarged index = OVERSAMPLING * (index + 1/2) - 1/2.
+        self._tile_origin = corner + OVERSAMPLING * (TILE_HALF_PX + 0.5) - 0.5
         side = np.arange(-HALF_PX - 1, HALF_PX + 2, dtype=np.float64)
         u, v = np.meshgrid(side, side)
         self._grid = np.stack([u.ravel(), v.ravel(), np.ones(u.size)]).astype(np.float32)
@@ -209,30 +211,21 @@ class PatchTracker:
         return np.asarray(sampled, dtype=np.float32).reshape(len(index), side, side)
 
 
-def _oversampled(tiles: NDArray[Any]) -> Singles:
-    """Return one mosaic of oversampled tiles (N, size, size); see `_tile_origins`."""
+def _tile_corners(count: int) -> NDArray[np.int64]:
+    """Return the mosaic coordinates (N, 2), as u, v, of the first pixel of each oversampled tile."""
+    number, columns = np.arange(count), max(1, int(np.ceil(np.sqrt(count))))
+    return np.stack([number % columns, number // columns], axis=1) * (2 * TILE_HALF_PX + 1) * OVERSAMPLING
+
+
+def _oversampled(tiles: NDArray[Any], corner: NDArray[np.int64]) -> Singles:
+    """Return one mosaic of oversampled tiles (N, size, size), laid out from their corners (N, 2)."""
     tile = tiles.shape[1] * OVERSAMPLING
-    rows, columns = _mosaic_shape(len(tiles))
-    mosaic = np.zeros((rows * tile, columns * tile), dtype=np.float32)
-    for number, patch in enumerate(tiles.astype(np.float32)):
-        top, left = (number // columns) * tile, (number % columns) * tile
+    width, height = corner.max(axis=0, initial=0) + tile
+    mosaic = np.zeros((height, width), dtype=np.float32)
+    for patch, (left, top) in zip(tiles.astype(np.float32), corner, strict=True):
         large = cv2.resize(patch, (tile, tile), interpolation=cv2.INTER_LANCZOS4)
         mosaic[top : top + tile, left : left + tile] = large
     return mosaic
-
-
-def _mosaic_shape(count: int) -> tuple[int, int]:
-    columns = max(1, int(np.ceil(np.sqrt(count))))
-    return max(1, -(-count // columns)), columns
-
-
-def _tile_origins(count: int) -> Floats:
-    """Return the mosaic coordinates (N, 2), as u, v, of each tile's centre."""
-    tile, columns = (2 * TILE_HALF_PX + 1) * OVERSAMPLING, _mosaic_shape(count)[1]
-    number = np.arange(count)
-    corner = np.stack([number % columns, number // columns], axis=1) * tile
-    # Pixel centres: enlarged index = OVERSAMPLING * (index + 1/2) - 1/2.
-    return np.asarray(corner + OVERSAMPLING * (TILE_HALF_PX + 0.5) - 0.5)
 
 
 def _mean_seen(views: Sequence[Singles], otherwise: Singles) -> Singles:

@@ -95,13 +95,16 @@ def combined_sigma(
     random = np.sqrt(points.places_m**2 + camera_m[:, None, :] ** 2 + shared_m[:, None, None] ** 2)
     factor, rotation_factor = np.ones((2, 2)), 1.0
     if still.sum() >= LEAST_STILL:
-        at_rest = np.sqrt((random[still] ** 2 + slow_m[still] ** 2).mean(axis=0))
-        factor = np.clip(places_m[still].std(axis=0) / at_rest, LEAST_FACTOR, MOST_FACTOR)
-        turning = float(np.sqrt((points.rotation_rad[still] ** 2).mean()))
-        rotation_factor = float(np.clip(rotation_rad[still].std() / turning, LEAST_FACTOR, MOST_FACTOR))
+        factor = _by_scatter(np.hypot(random, slow_m)[still], places_m[still], MOST_FACTOR)
+        rotation_factor = float(_by_scatter(points.rotation_rad[still], rotation_rad[still], MOST_FACTOR))
     wider = np.where(moving, MOVING, 1.0)
     places_sigma = np.sqrt((random * factor) ** 2 + slow_m**2)
     return Sigma(places_sigma * wider[:, None, None], points.rotation_rad * rotation_factor * wider)
+
+
+def _by_scatter(sigma: Floats, value: Floats, most: float) -> Floats:
+    """Return by what values (M, ...) at rest scatter more than their standard deviations say, within bounds."""
+    return np.asarray(np.clip(value.std(axis=0) / np.sqrt((sigma**2).mean(axis=0)), LEAST_FACTOR, most))
 
 
 def held_to_scatter(relative: TargetHistory, still: Bools) -> TargetHistory:
@@ -118,8 +121,7 @@ def held_to_scatter(relative: TargetHistory, still: Bools) -> TargetHistory:
         return relative
 
     def held(sigma: Floats, value: Floats) -> Floats:
-        usual = np.sqrt((sigma[still] ** 2).mean(axis=0))
-        return np.asarray(sigma * np.clip(value[still].std(axis=0) / usual, LEAST_FACTOR, 1.0))
+        return np.asarray(sigma * _by_scatter(sigma[still], value[still], 1.0))
 
     return replace(
         relative,

@@ -112,6 +112,12 @@ def truth(clip: Path) -> dict[str, Any]:
     return dict(np.load(clip / "truth.npz"))
 
 
+def true_displacement(clip: Path) -> Floats:
+    """Return (F, 2, 2) displacement of the roof's P1 and P2, from the first frame, as the renderer knows it."""
+    known = truth(clip)
+    return np.stack([known["roof_p1_m"], known["roof_p2_m"]], axis=1)
+
+
 def roof_pixel_m(brief: Brief) -> float:
     """Return what a pixel covers at roof level."""
     return (brief.altitude_m - brief.roof_m) / brief.focal_px

@@ -38,6 +38,7 @@ from tests.scenes.clips import (
     project_copy,
     rendered,
     roof_pixel_m,
+    true_displacement,
     truth,
     with_measurements,
 )
@@ -90,7 +91,7 @@ def largest_difference_m(one, other):
 
 
 def test_displacement_is_true_to_a_tenth_of_a_pixel(clip, run, history):
-    true = np.stack([truth(clip)["roof_p1_m"], truth(clip)["roof_p2_m"]], axis=1)
+    true = true_displacement(clip)
     error = displacement(history) - true
     # A strip's middle is found to better than a tenth of a pixel at this size, and the camera's place, learnt from
     # hundreds of ground patches, adds less than that.
@@ -158,7 +159,7 @@ def test_a_noisy_clip_is_compared_with_a_mean_of_frames(tmp_path_factory, tmp_pa
     for folder in (alone, shared):
         (folder / "results").mkdir()
     history = measured_history(alone)
-    true = np.stack([truth(clip)["roof_p1_m"], truth(clip)["roof_p2_m"]], axis=1)
+    true = true_displacement(clip)
     start, end = read_project(clip).intervals_s.pre_event
     rest = (history.time_s >= start) & (history.time_s <= end)
     error = displacement(history) - (true - true[rest].mean(axis=0))
@@ -171,7 +172,7 @@ def test_a_noisy_clip_is_compared_with_a_mean_of_frames(tmp_path_factory, tmp_pa
 def test_a_clip_that_starts_in_mid_shaking_finds_its_own_lines(tmp_path_factory):
     brief = replace(BRIEF, starts_s=3.0, recording=Recording(bit_rate=8_000_000))
     folder = rendered(tmp_path_factory, "mid-shaking", brief)
-    true = np.stack([truth(folder)["roof_p1_m"], truth(folder)["roof_p2_m"]], axis=1)
+    true = true_displacement(folder)
     history = measured_history(folder)
     start, end = read_project(folder).intervals_s.pre_event
     rest = true[(history.time_s >= start) & (history.time_s <= end)].mean(axis=0)
@@ -182,12 +183,11 @@ def test_a_clip_that_starts_in_mid_shaking_finds_its_own_lines(tmp_path_factory)
 def test_a_hidden_line_is_no_neighbouring_line(tmp_path_factory):
     brief = replace(BRIEF, post_event_s=2.4, recording=Recording(bit_rate=8_000_000), extras=(happenings.hidden_line,))
     folder = rendered(tmp_path_factory, "hidden-line", brief)
-    known = truth(folder)
     history = measured_history(folder)
-    error = displacement(history) - np.stack([known["roof_p1_m"], known["roof_p2_m"]], axis=1)
+    error = displacement(history) - true_displacement(folder)
     # The neighbouring strip lies 1.2 m away; whatever is stated must be about that line and no other.
     assert np.nanmax(np.abs(error)) < roof_pixel_m(BRIEF)
-    assert (history.status[~known["hidden"]] != Status.LOST).mean() > 0.98
+    assert (history.status[~truth(folder)["hidden"]] != Status.LOST).mean() > 0.98
 
 
 def test_a_clip_stored_on_its_side_is_measured_upright(tmp_path_factory):
@@ -204,7 +204,7 @@ def test_a_clip_stored_on_its_side_is_measured_upright(tmp_path_factory):
     inputs = load_inputs(folder)
     assert (inputs.info.width, inputs.info.height, inputs.info.rotation_deg) == (540, 960, 90)
     history = measured(inputs).histories["roof"]
-    error = displacement(history) - np.stack([truth(folder)["roof_p1_m"], truth(folder)["roof_p2_m"]], axis=1)
+    error = displacement(history) - true_displacement(folder)
     assert np.sqrt((error**2).mean(axis=0)).max() < 0.1 * roof_pixel_m(brief)
 
 
