@@ -181,11 +181,20 @@ def two_workers(folder: Path, count: int) -> dict[str, Any]:
 
 def two_on_dask(folder: Path, count: int) -> dict[str, Any]:
     """Run the engine on two workers of a Dask cluster on this machine, which has been started before."""
+    with _dask() as cluster:
+        return engine(folder, count, scheduler=cluster.scheduler_address)
+
+
+@contextmanager
+def _dask() -> Iterator[Any]:
+    """Start two workers of Dask as `core/CLUSTER.md` says, without Dask's profiler."""
     # Loads for a while, which is no part of what the others do.
+    import dask
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=logging.ERROR) as cluster:
-        return engine(folder, count, scheduler=cluster.scheduler_address)
+    how = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.ERROR}
+    with dask.config.set({"distributed.worker.profile.enabled": False}), LocalCluster(**how) as cluster:
+        yield cluster
 
 
 @contextmanager
@@ -242,7 +251,7 @@ def paper(folder: Path, count: int) -> dict[str, Any]:
 
 def costs(folder: Path, count: int) -> dict[str, Any]:
     """Measure what a campaign is planned with, in seconds of one core and in bytes; see `core/CLUSTER.md`."""
-    from distributed import Client, LocalCluster
+    from distributed import Client
 
     cv2.setNumThreads(1)
     inputs = load_inputs(folder)
@@ -260,10 +269,7 @@ def costs(folder: Path, count: int) -> dict[str, Any]:
     run_project(folder)
     with _core_seconds() as writing:
         run_project(folder)
-    with (
-        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=logging.ERROR) as cluster,
-        Client(cluster) as client,
-    ):
+    with _dask() as cluster, Client(cluster) as client:
         started = time.perf_counter()
         client.gather(client.map(len, [eyes] * EMPTY_TASKS, pure=False))
         empty_ms = (time.perf_counter() - started) / EMPTY_TASKS * 1e3
