@@ -12,14 +12,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import cached_property
 
-import av
 from av.container import InputContainer
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from core.errors import InputError
 from core.storage import File
-from core.video import FrameIndex, frame_index, opened_video
+from core.video import FrameIndex, decoded_pictures, frame_index, opened_video
 
 # Decoding on over so many frames is quicker than seeking to a key frame, which empties the decoder's threads.
 _READ_ON = 8
@@ -45,12 +44,8 @@ class SeekingReader:
         return frame_index(self._video)
 
     @cached_property
-    def _number(self) -> dict[int, int]:
-        return {tick: number for number, tick in enumerate(self.index.ticks)}
-
-    @cached_property
     def _key_frames(self) -> list[int]:
-        return [bisect.bisect_left(self.index.ticks, tick) for tick in self.index.key_ticks]
+        return self.index.key_frames
 
     def frame(self, number: int) -> VideoFrame:
         """Return a frame as decoded.
@@ -88,12 +83,9 @@ class SeekingReader:
         if self._pictures is None or not self._may_read_on(number):
             self._seek(number)
         assert self._pictures is not None
-        while True:
-            try:
-                picture = next(self._pictures)
-            except (StopIteration, av.error.InvalidDataError):
-                break
-            at = 0 if number == 0 else self._number.get(-1 if picture.pts is None else picture.pts)
+        for picture in self._pictures:
+            # Which frame a key frame at the very beginning is needs no looking up.
+            at = 0 if number == 0 and picture.key_frame else self.index.number_at(picture.pts)
             if at is None or at < self._first:
                 continue
             self._next = at + 1
@@ -119,7 +111,7 @@ class SeekingReader:
             container.seek(self.index.ticks[self._first], stream=stream, backward=True)
         elif self._pictures is not None:
             container.seek(0)
-        self._pictures = container.decode(stream)
+        self._pictures = decoded_pictures(container, stream)
         self._next = self._first
 
     def _opened(self) -> tuple[InputContainer, VideoStream]:

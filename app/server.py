@@ -28,7 +28,6 @@ from app.frames import FrameStore
 from app.growing import Growing
 from app.guards import LOOPBACK, Guard
 from app.jobs import Jobs
-from app.locks import take_charge
 from app.outcome import Outcomes
 from app.places import Places
 from app.scene3d import Scene3D
@@ -36,6 +35,7 @@ from app.sites import Sites
 from app.steps import STEPS, steps_of
 from app.store import Workspace
 from core.errors import InputError
+from core.locks import take_lock
 
 STATIC = Path(__file__).resolve().parent.parent / "static"
 DEFAULT_PORT = 8000
@@ -82,7 +82,7 @@ def create_app(workspace: Path, roots: Sequence[Path] = ()) -> FastAPI:
 @contextlib.asynccontextmanager
 async def _life(app: FastAPI) -> AsyncIterator[None]:
     context: Context = app.state.context
-    charge = take_charge(context.workspace.folder)
+    charge = take_lock(context.workspace.folder)
     if charge is not None:
         await run_in_threadpool(_tidy_and_go_on, context)
     try:

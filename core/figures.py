@@ -10,7 +10,6 @@ import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import wraps
-from pathlib import Path
 from typing import Any, ParamSpec
 
 import matplotlib as mpl
@@ -24,7 +23,7 @@ from core.coordinates import Floats
 from core.drift import AXIS_NAMES, CornerSweep, Spectrum, amplitude_spectrum, corner_sweep, high_pass
 from core.errors import InputError
 from core.intervals import within
-from core.project import Drift, Intervals, write_atomically
+from core.project import Drift, Intervals
 from core.results import TargetHistory
 from core.validation import GpsComparison
 
@@ -91,11 +90,6 @@ def _style() -> Iterator[None]:
         mpl.rcdefaults()
         mpl.rcParams.update(STYLE)
         yield
-
-
-def save(figure: Figure, path: Path, *, dpi: int = 150) -> None:
-    """Write a figure as PNG or SVG, by the name's ending; atomically, without a date in it."""
-    write_atomically(path, encoded(figure, path.suffix.removeprefix("."), dpi=dpi))
 
 
 def encoded(figure: Figure, file_format: str = "png", *, dpi: int = 150) -> bytes:

@@ -26,7 +26,7 @@ from core.measurements import FrameMeasurement, MeasurementStore, Reference
 from core.patches import PatchTracker, Singles
 from core.prediction import MeasureSetup, nothing_measured, predict_apparent, predict_homography
 from core.progress import CancelToken, Progress, silent
-from core.video import FrameIndex, FramesAhead, Luma, available_cores, frame_index, read_frames
+from core.video import Frame, FrameIndex, FramesAhead, Luma, available_cores, frame_index, read_frames
 from core.workers import Helpers, Order
 
 # So many frames after the reference frame an encoder no longer repeats it; where they correlate with it by less than
@@ -62,7 +62,7 @@ def make_measurer(
             decoded twice.
 
     Raises:
-        InputError: the video cannot be read, or the reference frame shows nothing to hold on to.
+        InputError: the video or its reference frame cannot be read, or that shows nothing to hold on to.
     """
     first = setup.reference_frame
     with ExitStack() as stack:
@@ -70,17 +70,18 @@ def make_measurer(
             cores = available_cores()
             stop = first + 1 + JUDGED_BY
             begun = stack.enter_context(FramesAhead(setup.video, first, stop, threads=cores, index=index))
-        lumas = (frame.luma for frame in begun.peek())
-        luma = next(lumas, None)
-        if luma is None:
-            raise InputError(f"{setup.video}: has no frame {first}; choose a smaller reference_frame.")
+        frames = begun.peek()
+        frame = next(frames, None)
+        if frame is None or frame.index != first:
+            raise InputError(f"{setup.video}: frame {first} cannot be decoded; choose another reference_frame.")
+        luma = frame.luma
         if setup.method == "paper":
             # Brings a library along that takes a while to load.
             from core.paper import PaperMeasurer
 
             return PaperMeasurer(luma, setup)
         measurer = GeometricMeasurer(luma, setup, reference)
-        if measurer.finds_noise(itertools.islice(lumas, JUDGED_BY)):
+        if measurer.finds_noise(frame.luma for frame in itertools.islice(frames, JUDGED_BY)):
             measurer.denoise(
                 frame.luma for frame in read_frames(setup.video, first + 1, first + 1 + VIEWS, index=index)
             )
@@ -152,7 +153,7 @@ def measure_chunk(
     index: FrameIndex | None = None,
     begun: FramesAhead | None = None,
 ) -> Iterator[FrameMeasurement]:
-    """Yield the measurements of a chunk's frames in order.
+    """Yield the measurements of a chunk's frames in order; in one that cannot be decoded nothing is measured.
 
     Args:
         before: the last two frames before the chunk, where known; otherwise the chunk finds its own way in.
@@ -160,16 +161,31 @@ def measure_chunk(
         index: of the video, where it is known already.
         begun: frames from the chunk's first on, where decoding them has begun already.
     """
+    index = index or frame_index(setup.video)
     first = chunk.start if before else max(0, chunk.start - WARM_UP)
     history = list(before)[-2:]
     with begun or FramesAhead(setup.video, first, chunk.stop, threads=threads, index=index) as frames:
-        for frame in frames:
-            if frame.index == chunk.stop:
-                return
-            measured = measurer.measure(frame.luma, frame=frame.index, time_s=frame.time_s, before=history)
+        for number, frame in _numbered(frames, first, chunk.stop):
+            time_s = index.time_s_of(number)
+            if frame is None:
+                measured = nothing_measured(measurer.reference, number, time_s)
+            else:
+                measured = measurer.measure(frame.luma, frame=number, time_s=time_s, before=history)
             history = [*history[-1:], measured]
-            if frame.index >= chunk.start:
+            if number >= chunk.start:
                 yield measured
+
+
+def _numbered(frames: Iterable[Frame], start: int, stop: int) -> Iterator[tuple[int, Frame | None]]:
+    """Yield all numbers from `start` to `stop` with their frames, None for those that did not come."""
+    expected = start
+    for frame in frames:
+        if frame.index >= stop:
+            break
+        yield from ((number, None) for number in range(expected, frame.index))
+        yield frame.index, frame
+        expected = frame.index + 1
+    yield from ((number, None) for number in range(expected, stop))
 
 
 def measure(
@@ -194,9 +210,7 @@ def measure(
         Cancelled: on request; what was measured stays.
     """
     cancel = cancel or CancelToken()
-    if fresh:
-        store.delete(setup.method)
-    recording = store.find(setup.method, setup.fingerprint)
+    recording = None if fresh else store.find(setup.method, setup.fingerprint)
     if recording is not None and store.is_finished(recording):
         return recording
     with ExitStack() as stack:

@@ -11,7 +11,7 @@ import sqlite3
 import time
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -95,7 +95,7 @@ class MeasurementStore:
     """The open file; one writer at a time.
 
     Raises:
-        InputError: the file exists and is something else.
+        InputError: the file exists and is something else; when writing, there is no room for more.
     """
 
     def __init__(self, file: Path) -> None:
@@ -113,8 +113,18 @@ class MeasurementStore:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._db.commit()
-        self._db.close()
+        with closing(self._db):
+            self.commit()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.OperationalError as error:
+            raise InputError(
+                f"{self._file}: cannot be written ({error}); make room on its disk and run again, which goes on from "
+                "what is there."
+            ) from None
 
     def find(self, method: str, fingerprint: str) -> int | None:
         """Return the number of a recording, or None."""
@@ -126,7 +136,7 @@ class MeasurementStore:
         """Start a recording, taking the place of earlier ones of the same method; return its number."""
         names = list(reference.targets_raw)
         arrays = [reference.ground_raw, *(reference.targets_raw[name] for name in names)]
-        with self._db:
+        with self._writing(), self._db:
             self._db.execute("DELETE FROM recordings WHERE method = ?", (method,))
             cursor = self._db.execute(
                 "INSERT INTO recordings (method, fingerprint, targets, reference) VALUES (?, ?, ?, ?)",
@@ -134,32 +144,29 @@ class MeasurementStore:
             )
         return int(cursor.lastrowid or 0)
 
-    def delete(self, method: str) -> None:
-        """Forget what was measured by a method."""
-        with self._db:
-            self._db.execute("DELETE FROM recordings WHERE method = ?", (method,))
-
     def append(self, recording: int, measured: FrameMeasurement) -> None:
         """Add a frame; it is safe on disk within a second."""
         names = list(measured.targets_raw)
         states = [_state(measured.apparent[name]) for name in names]
         arrays = [measured.ground_raw, *(measured.targets_raw[name] for name in names)]
         blob = np.concatenate([measured.H_ray_ray0.ravel(), *states]).astype("<f8").tobytes() + _packed(arrays)
-        self._db.execute(
-            "INSERT OR REPLACE INTO frames (recording, frame, time_s, measured) VALUES (?, ?, ?, ?)",
-            (recording, measured.frame, measured.time_s, blob),
-        )
+        with self._writing():
+            self._db.execute(
+                "INSERT OR REPLACE INTO frames (recording, frame, time_s, measured) VALUES (?, ?, ?, ?)",
+                (recording, measured.frame, measured.time_s, blob),
+            )
         if time.monotonic() - self._last_commit > COMMIT_EVERY_S:
             self.commit()
 
     def commit(self) -> None:
         """Make everything appended so far safe."""
-        self._db.commit()
+        with self._writing():
+            self._db.commit()
         self._last_commit = time.monotonic()
 
     def finish(self, recording: int) -> None:
         """Mark a recording as complete."""
-        with self._db:
+        with self._writing(), self._db:
             self._db.execute("UPDATE recordings SET finished = 1 WHERE id = ?", (recording,))
 
     def is_finished(self, recording: int) -> bool:
@@ -208,17 +215,6 @@ class MeasurementStore:
             ground_raw=np.array([frame.ground_raw for frame in frames]).reshape(-1, *reference.ground_raw.shape),
             targets_raw=stacked,
         )
-
-
-@contextmanager
-def latest_recording(file: Path, method: str) -> Iterator[tuple[MeasurementStore, int] | None]:
-    """Open the newest recording of a method, or None where nothing has been measured."""
-    if not file.exists():
-        yield None
-        return
-    with MeasurementStore(file) as store:
-        row = store._db.execute("SELECT id FROM recordings WHERE method = ?", (method,)).fetchone()
-        yield None if row is None else (store, int(row[0]))
 
 
 def _state(apparent: Apparent | None) -> Floats:

@@ -147,11 +147,6 @@ class LineTracker:
         context = (len(self.profile.signature) - 1) // 2
         self._reach = self._half_band + context + int(np.ceil(abs(self.profile.tilt_px))) + 1
 
-    @property
-    def station_place(self) -> Floats:
-        """(STATIONS,) of the stations' middles along the band, from 0 to 1."""
-        return (np.arange(STATIONS) + 0.5) / STATIONS
-
     def find(self, luma: Luma, to_raw: Mapping, *, search_px: float | None = None) -> LineMatch:
         """Return the line in a frame; see `find_strips`."""
         return find_strips([self], luma, to_raw, search_px=search_px)[0]

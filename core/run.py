@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -21,14 +22,14 @@ from core.georeference import ReferenceFit
 from core.ground_poses import fit_with_relief
 from core.intervals import within
 from core.lens import Lens, read_lens, require_image_size
+from core.locks import take_lock
 from core.measure import measure
-from core.measurements import MeasurementStore, Recording
+from core.measurements import MeasurementStore
 from core.orthoimage import make_orthoimage, write_geotiff
 from core.prediction import MeasureSetup, video_identity
 from core.progress import CancelToken, Progress, silent
 from core.project import Project, read_project, write_atomically
 from core.relief import Relief, rasterise
-from core.solution import Solution
 from core.solve import solve
 from core.storage import File, file_at, opened, state_of
 from core.validation import GpsRecord, read_gps
@@ -117,7 +118,7 @@ def run_project(
     _require_runnable(inputs)
     started = time.perf_counter()
     results = folder / "results"
-    with MeasurementStore(results / FRAMES_FILE) as store:
+    with _only_writer(results), MeasurementStore(results / FRAMES_FILE) as store:
         setup = inputs.setup()
         before = _frames_known(store, setup)
         recording_id = measure(
@@ -150,6 +151,21 @@ def run_project(
         progress,
     )
     return RunSummary(folder, len(recording.frame), new, measured_s, solved_s, summary)
+
+
+@contextmanager
+def _only_writer(results: Path) -> Iterator[None]:
+    """Keep other processes from measuring the same project.
+
+    Raises:
+        InputError: one of them does so already.
+    """
+    results.mkdir(parents=True, exist_ok=True)
+    lock = take_lock(results)
+    if lock is None:
+        raise InputError(f"{results.parent}: is being measured by another process; wait for its end, or stop it.")
+    with lock:
+        yield
 
 
 def load_inputs(folder: Path, progress: Progress = silent) -> LoadedInputs:
@@ -295,23 +311,6 @@ def _require_runnable(inputs: LoadedInputs) -> None:
 def _frames_known(store: MeasurementStore, setup: MeasureSetup) -> int:
     recording = store.find(setup.method, setup.fingerprint)
     return 0 if recording is None else len(store.measured_frames(recording))
-
-
-def solve_recorded(inputs: LoadedInputs) -> tuple[Recording, Solution] | None:
-    """Return what an earlier pass over the video measured, solved with the project as it stands now.
-
-    None where nothing has been measured for this method, video, moving regions and bands.
-    """
-    file = inputs.folder / "results" / FRAMES_FILE
-    if not file.exists():
-        return None
-    with MeasurementStore(file) as store:
-        setup = inputs.setup()
-        found = store.find(setup.method, setup.fingerprint)
-        if found is None:
-            return None
-        recording = store.load(found)
-    return recording, solve(recording, inputs.project, inputs.lens, inputs.relief, has_lens=inputs.has_lens)
 
 
 def _write_orthoimage(inputs: LoadedInputs, progress: Progress) -> None:

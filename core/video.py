@@ -12,6 +12,7 @@ import os
 import queue
 import sys
 import threading
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -74,6 +75,14 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class _Picture:
+    """A frame as decoded: its timestamp in stream ticks, and `luma` as of `Frame`."""
+
+    tick: int | None
+    luma: Luma
+
+
+@dataclass(frozen=True)
 class FrameIndex:
     """Where every presented frame lies: timestamps in stream ticks, ascending, and which may be decoded first."""
 
@@ -93,6 +102,15 @@ class FrameIndex:
     def time_s(self) -> NDArray[np.float64]:
         """(F,) seconds since the first presented frame."""
         return (np.array(self.ticks, dtype=np.float64) - self.ticks[0]) * self.tick_s
+
+    def time_s_of(self, number: int) -> float:
+        """Return seconds from the first presented frame to another."""
+        return float((self.ticks[number] - self.ticks[0]) * self.tick_s)
+
+    def number_at(self, tick: int | None) -> int | None:
+        """Return the number of the frame that bears a timestamp, or None where none does."""
+        place = len(self) if tick is None else bisect_left(self.ticks, tick)
+        return place if place < len(self) and self.ticks[place] == tick else None
 
 
 @contextmanager
@@ -131,10 +149,9 @@ def probe(path: File) -> VideoInfo:
         InputError: no such file, no container, no video stream, or no frame that can be decoded.
     """
     with opened_video(path) as (container, stream):
-        try:
-            frame = next(container.decode(stream))
-        except (StopIteration, av.error.FFmpegError):
-            raise InputError(f"{path}: not one frame can be decoded; export the video again as H.264 MP4.") from None
+        frame = next(decoded_pictures(container, stream), None)
+        if frame is None:
+            raise InputError(f"{path}: not one frame can be decoded; export the video again as H.264 MP4.")
         quarter_turned = frame.rotation % 180 != 0
         width, height = (frame.height, frame.width) if quarter_turned else (frame.width, frame.height)
         duration_s = _duration_s(container, stream)
@@ -173,17 +190,22 @@ def frame_index(path: File) -> FrameIndex:
 def _frame_index(path: File, state: FileState) -> FrameIndex:
     ticks: list[int] = []
     keys: list[int] = []
+    first_key: int | None = None
     with opened_video(path) as (container, stream):
-        try:
-            for packet in container.demux(stream):
-                if packet.pts is None or packet.is_discard:
-                    continue
-                ticks.append(packet.pts)
-                if packet.is_keyframe:
-                    keys.append(packet.pts)
-        except av.error.FFmpegError:
-            pass  # a file cut off in the middle: what came before it can still be measured
+        for packet in _packets(container, stream):
+            if packet.pts is None:
+                continue
+            if packet.is_keyframe and first_key is None:
+                first_key = packet.pts
+            if packet.is_discard:
+                continue
+            ticks.append(packet.pts)
+            if packet.is_keyframe:
+                keys.append(packet.pts)
         tick_s = float(stream.time_base or 0)
+    if first_key is not None:
+        # A clip cut out of a longer one may begin with frames that need others from before the cut.
+        ticks = [tick for tick in ticks if tick >= first_key]
     if not ticks:
         raise InputError(f"{path}: its video stream holds no frames; export the video again.")
     if repeated := len(ticks) - len(set(ticks)):
@@ -197,7 +219,7 @@ def _frame_index(path: File, state: FileState) -> FrameIndex:
 class FramesAhead:
     """Frames `start` to `stop` (exclusive; None for all), decoded ahead in a thread of its own from now on.
 
-    A context, at whose end the thread is gone.
+    A context, at whose end the thread is gone. Frames that are damaged are left out, which their numbers show.
 
     Args:
         threads: decoder threads, 0 for as many as keep all cores busy while somebody works on the frames.
@@ -212,13 +234,17 @@ class FramesAhead:
     ) -> None:
         _give_pictures_back()
         self.start = start
-        self._ahead: queue.Queue[Frame | Exception | None] = queue.Queue(maxsize=READ_AHEAD)
+        self._path = path
+        # All frames may be decoded before it is known which they are.
+        self._index = index or (frame_index(path) if start > 0 or stop is not None else None)
+        self._ahead: queue.Queue[_Picture | Exception | None] = queue.Queue(maxsize=READ_AHEAD)
         self._seen: deque[Frame] = deque()
         self._ended = False
         self._stopped = threading.Event()
         threads = threads or min(MOST_THREADS, THREADS_PER_CORE * available_cores())
-        frames = _decoded(path, start, stop, threads, index)
-        self._thread = threading.Thread(target=self._decode, args=(frames,), name="video decoder", daemon=True)
+        decoded = _decoded(path, self._index, start, stop, threads)
+        pictures = (_Picture(picture.pts, luma_of(picture)) for picture in decoded)
+        self._thread = threading.Thread(target=self._decode, args=(pictures,), name="video decoder", daemon=True)
         self._thread.start()
 
     def __enter__(self) -> FramesAhead:
@@ -253,22 +279,30 @@ class FramesAhead:
             yield frame
 
     def _next(self) -> Frame | None:
+        while (picture := self._next_picture()) is not None:
+            # Looked up here and not by the decoder, which need not wait for the index.
+            self._index = self._index or frame_index(self._path)
+            if (number := self._index.number_at(picture.tick)) is not None:
+                return Frame(number, self._index.time_s_of(number), picture.luma)
+        return None
+
+    def _next_picture(self) -> _Picture | None:
         item = None if self._ended else self._ahead.get()
         self._ended = item is None or isinstance(item, Exception)
         if isinstance(item, Exception):
             raise item
         return item
 
-    def _decode(self, frames: Iterator[Frame]) -> None:
+    def _decode(self, pictures: Iterator[_Picture]) -> None:
         try:
-            for frame in frames:
-                if not self._hand_over(frame):
+            for picture in pictures:
+                if not self._hand_over(picture):
                     return
             self._hand_over(None)
         except Exception as error:  # handed to the reading thread, which raises it
             self._hand_over(error)
 
-    def _hand_over(self, item: Frame | Exception | None) -> bool:
+    def _hand_over(self, item: _Picture | Exception | None) -> bool:
         while not self._stopped.is_set():
             try:
                 self._ahead.put(item, timeout=0.1)
@@ -305,22 +339,11 @@ def read_frame(path: File, number: int, *, index: FrameIndex | None = None) -> F
         index: as for `read_frames`.
 
     Raises:
-        InputError: as `read_frames`, or there is no such frame.
+        InputError: as `read_frames`, or the frame is damaged.
     """
-    for frame in _decoded(path, number, number + 1, available_cores(), index):
+    for frame in read_frames(path, number, number + 1, threads=available_cores(), index=index):
         return frame
-    raise InputError(f"{path}: has no frame {number}; choose a smaller frame number.")
-
-
-def read_frame_rgb(path: File, index: int) -> NDArray[np.uint8]:
-    """Return one frame as (height, width, 3) RGB for people to look at.
-
-    Raises:
-        InputError: as `read_frame`.
-    """
-    for _, rgb in read_frames_rgb(path, index, index + 1):
-        return rgb
-    raise InputError(f"{path}: has no frame {index}; choose a smaller frame number.")
+    raise InputError(f"{path}: frame {number} cannot be decoded; choose another, or export the video again.")
 
 
 def read_frames_rgb(path: File, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, NDArray[np.uint8]]]:
@@ -329,61 +352,59 @@ def read_frames_rgb(path: File, start: int = 0, stop: int | None = None) -> Iter
     Raises:
         InputError: as `read_frames`.
     """
-    for picture, index in _pictures(path, start, stop, available_cores(), None):
-        yield index, np.ascontiguousarray(np.rot90(picture.to_ndarray(format="rgb24"), picture.rotation // 90))
+    index = frame_index(path)
+    for picture in _decoded(path, index, start, stop, available_cores()):
+        if (number := index.number_at(picture.pts)) is not None:
+            yield number, np.ascontiguousarray(np.rot90(picture.to_ndarray(format="rgb24"), picture.rotation // 90))
 
 
-def _decoded(path: File, start: int, stop: int | None, threads: int, index: FrameIndex | None) -> Iterator[Frame]:
-    first_tick: int | None = (index or frame_index(path)).ticks[0] if start > 0 else None
-    for picture, number in _pictures(path, start, stop, threads, index):
-        if first_tick is None:
-            first_tick = picture.pts or 0
-        time_s = float(((picture.pts or 0) - first_tick) * (picture.time_base or 0))
-        yield Frame(index=number, time_s=time_s, luma=luma_of(picture))
-
-
-def _pictures(
-    path: File, start: int, stop: int | None, threads: int, index: FrameIndex | None
-) -> Iterator[tuple[VideoFrame, int]]:
-    """Yield decoded pictures with their frame numbers; numbers after a seek come from the timestamps alone."""
+def _decoded(path: File, index: FrameIndex | None, start: int, stop: int | None, threads: int) -> Iterator[VideoFrame]:
+    """Yield what can be decoded of frames `start` to `stop`, or of the whole file where there is no index."""
+    if index is not None and start >= len(index):
+        raise InputError(f"{path}: has {len(index)} frames, so there is no frame {start}; choose a smaller number.")
     with opened_video(path) as (container, stream):
         stream.codec_context.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
-        position = _seek(container, stream, path, start, index) if start > 0 else None
-        number = 0
-        for picture in _until_damaged(container, stream):
-            if position is not None:
-                if picture.pts is None or picture.pts not in position:
-                    continue
-                number = position[picture.pts]
-            if number >= start:
-                if stop is not None and number >= stop:
-                    return
-                yield picture, number
-            number += 1
+        if index is not None and start > 0:
+            _seek(container, stream, index, start)
+        for picture in decoded_pictures(container, stream):
+            number = None if index is None else index.number_at(picture.pts)
+            if number is not None and stop is not None and number >= stop:
+                return
+            if index is None or (number is not None and number >= start):
+                yield picture
 
 
-def _until_damaged(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
-    """Decode to the end of the stream or of what can be read of it."""
-    pictures = container.decode(stream)
+def decoded_pictures(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
+    """Yield all pictures from where a video stands on; what is damaged is left out.
+
+    Raises:
+        InputError: the file cannot be read on.
+    """
+    for packet in _packets(container, stream):
+        try:
+            yield from packet.decode()
+        except av.error.InvalidDataError:
+            continue
+
+
+def _packets(container: InputContainer, stream: VideoStream) -> Iterator[av.Packet[VideoStream]]:
+    """Yield packets to the end of the file, or to where its structure is broken."""
+    packets = container.demux(stream)
     while True:
         try:
-            yield next(pictures)
+            yield next(packets)
         except (StopIteration, av.error.InvalidDataError):
             return
+        except (av.error.FFmpegError, OSError) as error:
+            raise InputError(f"{container.name}: cannot be read on ({_reason(error)}); try again.") from None
 
 
-def _seek(
-    container: InputContainer, stream: VideoStream, path: File, start: int, index: FrameIndex | None
-) -> dict[int, int]:
-    """Go to the last key frame at or before frame `start`; return the frame number of every timestamp."""
-    index = index or frame_index(path)
-    if start >= len(index):
-        raise InputError(f"{path}: has {len(index)} frames, so there is no frame {start}; choose a smaller number.")
+def _seek(container: InputContainer, stream: VideoStream, index: FrameIndex, start: int) -> None:
+    """Go to the last key frame at or before frame `start`."""
     keys = [tick for tick in index.key_ticks if tick <= index.ticks[start]]
     if keys:
         container.seek(keys[-1], stream=stream, backward=True)
-    return {tick: number for number, tick in enumerate(index.ticks)}
 
 
 def available_cores() -> int:

@@ -16,7 +16,7 @@ from fastapi.testclient import TestClient
 
 from app.archives import archive_stream
 from app.context import Context
-from app.locks import LOCK_FILE
+from core.locks import LOCK_FILE
 
 SMALL = "/api/projects/small"
 

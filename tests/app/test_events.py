@@ -10,7 +10,7 @@ from typing import Any
 from app.api.events import _stream
 from app.context import Context
 from app.events import Hub
-from app.locks import take_charge
+from core.locks import take_lock
 from core.project import read_project, write_project
 
 
@@ -66,10 +66,10 @@ def test_a_tab_that_does_not_listen_costs_no_memory() -> None:
 
 
 def test_one_server_at_a_time_is_in_charge_of_a_workspace(tmp_path: Path) -> None:
-    first = take_charge(tmp_path)
+    first = take_lock(tmp_path)
     assert first is not None
-    assert take_charge(tmp_path) is None
+    assert take_lock(tmp_path) is None
     first.close()
-    second = take_charge(tmp_path)
+    second = take_lock(tmp_path)
     assert second is not None
     second.close()

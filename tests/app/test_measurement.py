@@ -17,12 +17,10 @@ import pytest
 from app.jobs import JOB_FILE
 from app.outcome import recorded_of
 from app.server import create_app
-from core.measure import measure
-from core.measurements import MeasurementStore
 from core.results import CSV_HEADER
-from core.run import FRAMES_FILE, load_inputs, solve_recorded
 from tests.app.conftest import ADDRESS, WRITE, TestClient
 from tests.app.measured import SIZE, displacement_m, write_measurable
+from tests.scenes.clips import measured_history
 
 FRAMES = 40
 CLIP = "/api/projects/clip"
@@ -208,12 +206,7 @@ def test_tracking_is_cancelled_goes_on_by_itself_after_a_restart_and_ends_as_if_
         assert ended["result"]["frames_measured"] == frames - stopped
     whole = tmp_path / "whole"
     shutil.copytree(tmp_path / "clip", whole / "clip", ignore=shutil.ignore_patterns("results"))
-    inputs = load_inputs(whole / "clip")
-    with MeasurementStore(whole / "clip" / "results" / FRAMES_FILE) as store:
-        measure(inputs.setup(), store)
-    solved = solve_recorded(inputs)
-    assert solved is not None
-    at_once = solved[1].histories["roof"].p1_m
+    at_once = measured_history(whole / "clip").p1_m
     in_pieces = np.stack([_column(tmp_path / "clip", name) for name in ("p1_dx_m", "p1_dy_m")], axis=1)
     assert in_pieces == pytest.approx(at_once, abs=1e-5)
 

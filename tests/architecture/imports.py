@@ -18,6 +18,7 @@ ORDER = (
     "progress",
     "coordinates",
     "storage",
+    "locks",
     "intervals",
     "project",
     "video",

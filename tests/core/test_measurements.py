@@ -11,7 +11,7 @@ import pytest
 
 from core.errors import InputError
 from core.following import Apparent
-from core.measurements import FrameMeasurement, MeasurementStore, Reference, latest_recording
+from core.measurements import FrameMeasurement, MeasurementStore, Reference
 
 # Raw pixels are kept to this part of a pixel.
 TICK_PX = 1 / 8192
@@ -114,10 +114,8 @@ def test_a_new_recording_takes_the_place_of_its_method_only(tmp_path: Path) -> N
         assert paper is not None
         assert len(store.measured_frames(new)) == 2
         assert len(store.measured_frames(paper)) == 4
-        store.delete("paper")
-        assert store.find("paper", "a") is None
     with sqlite3.connect(file) as database:
-        assert database.execute("SELECT count(*) FROM frames").fetchone() == (2,)
+        assert database.execute("SELECT count(*) FROM frames").fetchone() == (6,)
 
 
 def test_finished_is_remembered(tmp_path: Path) -> None:
@@ -163,17 +161,22 @@ def test_what_was_committed_survives_a_kill(tmp_path: Path) -> None:
         assert store.measured_frames(recording)[:6] == list(range(6))
 
 
-def test_the_latest_recording_of_a_method(tmp_path: Path) -> None:
+def test_a_full_disk_is_said_and_keeps_what_is_there(tmp_path: Path) -> None:
     file = tmp_path / "frames.sqlite"
-    with latest_recording(file, "geometric") as found:
-        assert found is None
-    assert not file.exists()
-    recording = fill(file, range(2))
-    with latest_recording(file, "geometric") as found:
-        assert found is not None
-        assert found[1] == recording
-    with latest_recording(file, "paper") as found:
-        assert found is None
+    recording = fill(file, range(20))
+
+    def fill_on() -> None:
+        with MeasurementStore(file) as store:
+            # SQLite then answers as on a full disk.
+            pages = store._db.execute("PRAGMA page_count").fetchone()[0]
+            store._db.execute(f"PRAGMA max_page_count = {pages + 2}")
+            for frame in range(20, 60):
+                store.append(recording, measured(frame))
+
+    with pytest.raises(InputError, match=r"frames\.sqlite: cannot be written .* make room"):
+        fill_on()
+    with MeasurementStore(file) as store:
+        assert store.measured_frames(recording)[:20] == list(range(20))
 
 
 def test_a_file_that_is_something_else_is_refused_and_kept(tmp_path: Path) -> None:

@@ -148,7 +148,7 @@ def test_covered_stations_are_left_out_and_do_not_pull() -> None:
     luma = frame(strip()).copy()
     luma[80:130, 120:160] = 90  # someone stands on the strip
     found = tracker().find(luma, moved_by())
-    covered = tracker().station_place * 240 + 40 - 140
+    covered = (np.arange(STATIONS) + 0.5) / STATIONS * 240 + 40 - 140
     inside = np.abs(covered) < 17
     assert np.isnan(found.edges_raw[inside]).all()
     outside = np.abs(covered) > 25

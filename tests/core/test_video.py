@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from core.errors import InputError
-from core.video import FramesAhead, Luma, frame_index, probe, read_frame, read_frame_rgb, read_frames, read_frames_rgb
+from core.video import FramesAhead, Luma, frame_index, probe, read_frame, read_frames, read_frames_rgb
+from tests.packets import repacked
 
 SIZE = (96, 64)
 FRAMES = 50
@@ -119,7 +120,8 @@ def test_a_part_is_the_same_as_in_the_whole(video: Path, start: int) -> None:
 def test_single_frames(video: Path) -> None:
     for number in (0, 25, 49):
         assert number_of(read_frame(video, number).luma) == number
-        rgb = read_frame_rgb(video, number)
+        [(index, rgb)] = read_frames_rgb(video, number, number + 1)
+        assert index == number
         assert rgb.shape == (64, 96, 3)
         assert number_of(rgb[..., 1]) == number
     assert [index for index, _ in read_frames_rgb(video, 20, 24)] == [20, 21, 22, 23]
@@ -143,7 +145,7 @@ def test_turned_frames_are_made_upright(tmp_path: Path, rotation: int, corner: t
     info = probe(file)
     assert info.rotation_deg == rotation
     assert (info.width, info.height) == ((96, 64) if rotation == 180 else (64, 96))
-    luma, rgb = read_frame(file, 1).luma, read_frame_rgb(file, 1)
+    luma, [(_, rgb)] = read_frame(file, 1).luma, list(read_frames_rgb(file, 1, 2))
     assert luma.shape == rgb.shape[:2] == (info.height, info.width)
     # The bright corner was at the top left; it turns clockwise with the picture.
     assert luma[corner] > 200
@@ -219,7 +221,47 @@ def test_frames_beyond_the_end(video: Path) -> None:
     with pytest.raises(InputError, match="there is no frame 70"):
         read_frame(video, 70)
     with pytest.raises(InputError, match="there is no frame 70"):
-        read_frame_rgb(video, 70)
+        list(read_frames_rgb(video, 70))
+
+
+@pytest.mark.parametrize("codec", ["libx264", "libx265"])
+@pytest.mark.parametrize("damaged", [5, 24, 31])
+def test_frames_behind_a_damaged_one_keep_their_numbers(tmp_path: Path, codec: str, damaged: int) -> None:
+    options = {"x265-params": "keyint=12:min-keyint=12:log-level=0"} if codec == "libx265" else {}
+    whole = write(tmp_path / "whole.mp4", codec=codec, options=options)
+    file = repacked(
+        whole, tmp_path / "damaged.mp4", lambda number, data: bytes(len(data)) if number == damaged else data
+    )
+    frames = list(read_frames(file))
+    numbers = [frame.index for frame in frames]
+    missing = set(range(FRAMES)) - set(numbers)
+    # A key frame takes with it what is decoded from it.
+    assert 0 < len(missing) <= 12
+    assert [number_of(frame.luma) for frame in frames[-8:]] == numbers[-8:] == list(range(FRAMES - 8, FRAMES))
+    np.testing.assert_allclose([frame.time_s for frame in frames], np.array(numbers) / 25, atol=1e-9)
+    assert [frame.index for frame in read_frames(file, 3)] == numbers[3 - len([n for n in missing if n < 3]) :]
+    with pytest.raises(InputError, match=f"frame {min(missing)} cannot be decoded; choose another"):
+        read_frame(file, min(missing))
+
+
+@pytest.mark.parametrize(
+    ("codec", "open_groups"), [("libx264", "open_gop=1:b-adapt=0"), ("libx265", "open-gop=1:log-level=0")]
+)
+def test_a_clip_cut_out_of_a_longer_one_begins_with_its_key_frame(tmp_path: Path, codec: str, open_groups: str) -> None:
+    groups = f"keyint=12:min-keyint=12:bframes=3:scenecut=0:{open_groups}"
+    whole = write(tmp_path / "whole.mkv", codec=codec, options={f"{codec[3:]}-params": groups})
+    with av.open(str(whole)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.pts is not None]
+    key = [number for number, packet in enumerate(packets) if packet.is_keyframe][1]
+    # Frames shown before the key frame follow it in the file, and need the group before.
+    assert any((packet.pts or 0) < (packets[key].pts or 0) for packet in packets[key:])
+    file = repacked(whole, tmp_path / "cut.mkv", lambda number, data: None if number < key else data)
+    from_start = {frame.index: number_of(frame.luma) for frame in read_frames(file)}
+    assert list(from_start) == list(range(len(frame_index(file))))
+    assert from_start[0] == sorted(packet.pts or 0 for packet in packets).index(packets[key].pts or 0)
+    assert {frame.index: number_of(frame.luma) for frame in read_frames(file, 9)} == {
+        number: shown for number, shown in from_start.items() if number >= 9
+    }
 
 
 def test_a_file_cut_off_gives_what_came_before(tmp_path: Path) -> None:

@@ -20,16 +20,20 @@ import pytest
 from app import cli
 from core import measure as measuring
 from core.chunks import Chunk
+from core.errors import InputError
 from core.lens import read_lens, write_lens
+from core.locks import take_lock
 from core.measure import make_measurer, measure_chunk
 from core.measurements import MeasurementStore
 from core.project import read_project
 from core.results import Status, read_history_csv
-from core.run import FRAMES_FILE, load_inputs, run_project, solve_recorded
+from core.run import FRAMES_FILE, RELIEF_FILE, load_inputs, run_project
 from core.solve import solve
+from core.video import read_frames
 from sample_data import happenings
 from sample_data.accuracy import apparent_displacement
 from sample_data.scene import Recording
+from tests.packets import repacked
 from tests.scenes.clips import (
     BRIEF,
     displacement,
@@ -340,6 +344,53 @@ def _moved_region(project):
     return {"moving_regions_px": [region, *project.moving_regions_px[1:]]}
 
 
+def _damaged(clip, folder):
+    """Return a project with a damaged packet in its video, and the numbers of the frames that this takes away."""
+    project_copy(clip, folder)
+    (folder / "video.mp4").unlink()
+    repacked(clip / "video.mp4", folder / "video.mp4", lambda n, data: bytes(len(data)) if n == 100 else data)
+    decoded = [frame.index for frame in read_frames(folder / "video.mp4")]
+    return folder, np.setdiff1d(np.arange(ALL_FRAMES), decoded)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_damaged_frames_are_lost_and_those_behind_them_keep_their_numbers(clip, history, tmp_path, workers):
+    folder, missing = _damaged(clip, tmp_path / "damaged")
+    assert 0 < len(missing) < 40
+    found = measured_history(folder, workers=workers)
+    np.testing.assert_array_equal(found.frame, history.frame)
+    np.testing.assert_allclose(found.time_s, history.time_s, rtol=0, atol=5.1e-7)
+    assert (found.status[missing] == Status.LOST).all()
+    # Before the damage everything is as it was, and long after it again.
+    untouched = [*range(int(missing[0]) - 1), *range(ALL_FRAMES - 10, ALL_FRAMES)]
+    assert np.nanmax(np.abs(displacement(found) - displacement(history))[untouched]) < roof_pixel_m(BRIEF) / 10
+    assert frames_of_finished(folder) == ALL_FRAMES
+
+
+def frames_of_finished(folder):
+    """Return how many frames a finished recording holds."""
+    with MeasurementStore(folder / "results" / FRAMES_FILE) as store:
+        setup = load_inputs(folder).setup()
+        recording = store.find(setup.method, setup.fingerprint)
+        assert store.is_finished(recording)
+        return len(store.measured_frames(recording))
+
+
+def test_a_damaged_reference_frame_is_named(clip, tmp_path):
+    folder, missing = _damaged(clip, tmp_path / "damaged")
+    _edit(folder, lambda d: d.update(reference_frame=int(missing[0])))
+    with pytest.raises(InputError, match=f"frame {missing[0]} cannot be decoded; choose another reference_frame"):
+        measured_history(folder)
+
+
+def test_one_process_at_a_time_measures_a_project(run, tmp_path):
+    folder = with_measurements(run, tmp_path / "busy")
+    lock = take_lock(folder / "results")
+    with lock, pytest.raises(InputError, match="busy: is being measured by another process; wait for its end"):
+        run_project(folder)
+    assert run_project(folder).frames_measured == 0
+
+
 def test_what_only_geometry_needs_never_reads_the_video_again(run, history, tmp_path):
     project = read_project(run)
     pairs = [json.loads(pair.model_dump_json()) for pair in project.correspondences]
@@ -372,7 +423,9 @@ def test_what_only_geometry_needs_never_reads_the_video_again(run, history, tmp_
 @pytest.mark.parametrize("change", [_moved_band, _moved_region])
 def test_another_place_to_look_at_is_measured_anew(run, tmp_path, change):
     folder = with_measurements(run, tmp_path / "changed", **change(read_project(run)))
-    assert solve_recorded(load_inputs(folder)) is None
+    setup = load_inputs(folder).setup()
+    with MeasurementStore(folder / "results" / FRAMES_FILE) as store:
+        assert store.find(setup.method, setup.fingerprint) is None
 
 
 # --- mistakes --------------------------------------------------------------------------------------------------------
@@ -456,14 +509,13 @@ def _interval_outside(folder):
         (_interval_outside, "intervals_s.residual"),
     ],
 )
-def test_a_mistake_gets_one_sentence_and_destroys_nothing(clip, tmp_path, capsys, mistake, place):
-    folder = project_copy(clip, tmp_path / "mistaken")
-    earlier = folder / "results" / "roof.csv"
-    earlier.parent.mkdir()
-    earlier.write_text("earlier results")
+def test_a_mistake_gets_one_sentence_and_destroys_nothing(run, tmp_path, capsys, mistake, place):
+    folder = project_copy(run, tmp_path / "mistaken")
+    shutil.copytree(run / "results", folder / "results")
+    earlier = results_of(folder)
     mistake(folder)
     decided = (folder / "project.json").read_bytes()
-    assert cli.main(["run", str(folder)]) == 1
+    assert cli.main(["run", "--fresh", str(folder)]) == 1
     said = capsys.readouterr().err.strip()
     assert place in said
     assert said.count("\n") == 0, said
@@ -471,4 +523,10 @@ def test_a_mistake_gets_one_sentence_and_destroys_nothing(clip, tmp_path, capsys
     assert "Traceback" not in said
     assert "unexpected" not in said
     assert (folder / "project.json").read_bytes() == decided
-    assert earlier.read_text() == "earlier results"
+    assert results_of(folder) == earlier
+
+
+def results_of(folder):
+    """Return all results but what is kept only to be quicker."""
+    files = [file for file in (folder / "results").rglob("*") if file.is_file() and RELIEF_FILE not in file.name]
+    return {str(file): file.read_bytes() for file in files}
