@@ -7,10 +7,19 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from core.camera import Pose, PoseFit, intersect_height
-from core.coordinates import Bools, Floats, batches
+from core.coordinates import Bools, Floats, batches, finite_median
 from core.lens import Lens
 from core.measurements import Recording
-from core.motion import LineSet, RigidFit, fit_line, rigid_from_lines, rigid_from_points, rigid_with_weights
+from core.motion import (
+    LineSet,
+    RigidFit,
+    fit_line,
+    is_determined,
+    is_determined_as_whole,
+    rigid_from_lines,
+    rigid_from_points,
+    rigid_with_weights,
+)
 
 # Frames fitted at a time; what scatter is usual is told from them.
 BATCH = 1024
@@ -30,12 +39,14 @@ class RestBody:
     Attributes:
         lines: of a lines target, else None.
         points: (N, 2) of a points target, else None.
+        stations: (L, S, 2) of a lines target, nan where not seen; else None.
         centre: (2,) pivot.
         places: (2, 2) P1 and P2.
     """
 
     lines: LineSet | None
     points: Floats | None
+    stations: Floats | None
     centre: Floats
     places: Floats
 
@@ -72,6 +83,21 @@ class RestBody:
         assert at_rest is not None
         return rigid_with_weights(points, weight, at_rest, self.centre)
 
+    def is_determined(self, fit: RigidFit) -> Bools:
+        """Return (F,) whether frames fix the motion.
+
+        That the points of a textured roof scatter more than usual is no weakness: their standard deviation says it.
+        """
+        if self.stations is None:
+            return is_determined(fit.normal)
+        sigma = finite_median(fit.sigma.T)
+        if not sigma.any():
+            return np.zeros(len(fit.normal), dtype=np.bool_)
+        # A line that is never seen would be as noisy as the others.
+        noise = np.where(sigma > 0, sigma, sigma.max())
+        weight = np.broadcast_to((1.0 / noise**2)[:, None], self.stations.shape[:2])
+        return is_determined_as_whole(fit.normal, self.fit_with(self.stations[None], weight[None]).normal[0])
+
 
 def midpoints(raw: Floats) -> Floats:
     """Return what carries the motion: mid-lines (F, L, S, 2) of edges (F, L, S, 2, 2), or patches as they are."""
@@ -89,8 +115,8 @@ def rest_body(recording: Recording, name: str, lens: Lens, pose0: Pose, z_m: flo
         centre = np.nanmean(places, axis=0)
         _, _, axes = np.linalg.svd(places - centre, full_matrices=False)
         arm = axes[0] * np.ptp((places - centre) @ axes[0]) / 4
-        return RestBody(None, places, centre, np.stack([centre + arm, centre - arm]))
+        return RestBody(None, places, None, centre, np.stack([centre + arm, centre - arm]))
     centre = np.nanmean(places.reshape(-1, 2), axis=0)
     fits = [fit_line(line, np.ones(len(line)), centre) for line in places]
     lines = LineSet(np.array([n for n, _ in fits]), np.array([o for _, o in fits]), centre)
-    return RestBody(lines, None, centre, np.stack([lines.intersection(0, 2), lines.intersection(1, 2)]))
+    return RestBody(lines, None, places, centre, np.stack([lines.intersection(0, 2), lines.intersection(1, 2)]))

@@ -175,6 +175,8 @@ def calibrate(evidence: Evidence) -> SelfCalibration:
     calm = [number for number, own in noise.items() if (own <= TREMBLING * usual + LEAST_NOISE_M).all()]
     sigma = np.stack([noise[int(number)] for number in part])
     sigma[~(np.isfinite(at_start) & np.isin(part, calm)[:, None])] = np.nan
+    if not np.isfinite(sigma).any():
+        return refused(parameters, "no target was measured while the building stands still")
     return self_calibrate(parameters, motion, sigma, ground_misfit(evidence), part=part)
 
 
@@ -297,11 +299,9 @@ def calibration_sigma(evidence: Evidence, calibration: SelfCalibration) -> dict[
     It changes as slowly as the camera drifts, so it is computed at some frames and interpolated.
     """
     recording, targets = evidence.recording, evidence.project.targets
-    frames = len(recording.frame)
-    unknown = {target.name: np.full((frames, 2, 2), np.nan) for target in targets}
     usable = np.flatnonzero(evidence.ground.usable)
     if not len(usable):
-        return unknown
+        return {target.name: np.full((len(recording.frame), 2, 2), np.nan) for target in targets}
     chosen = usable[evenly_spread(len(usable), MOMENTS)]
     trials = _Trials(evidence, [np.array([frame]) for frame in chosen])
     motion = trials.motion(calibration.correction)
@@ -309,16 +309,31 @@ def calibration_sigma(evidence: Evidence, calibration: SelfCalibration) -> dict[
     J = np.stack([trials.motion(calibration.correction + d) - motion for d in np.diag(steps)], -1) / steps
     sums, differences = J.reshape(len(chosen), len(targets), 2, 2, -1).transpose(2, 0, 1, 3, 4)
     J = np.stack([sums + differences, sums - differences], axis=2) / np.sqrt(2.0)  # (B, targets, P1 P2, x y, P)
-    known = np.isfinite(J).all(axis=(1, 2, 3, 4))
+    still = during(recording.time_s, evidence.project.intervals_s.pre_event)[chosen]
+    moments_s = recording.time_s[chosen]
+    return {
+        target.name: _sigma_from_rest(J[:, number], calibration.covariance, still, moments_s, recording.time_s)
+        for number, target in enumerate(targets)
+    }
+
+
+def _sigma_from_rest(J: Floats, covariance: Floats, still: Bools, moments_s: Floats, time_s: Floats) -> Floats:
+    """Return what an uncertain calibration moves P1 and P2 by from rest, (F, 2, 2); nan where no moment tells.
+
+    Args:
+        J: (B, 2, 2, P) derivatives of P1 and P2 at some moments; nan where the target was not measured.
+        covariance: (P, P) of the corrections.
+        still: (B,) moments of the stationary part.
+        moments_s: (B,) and time_s (F,), seconds.
+    """
+    known = np.isfinite(J).all(axis=(1, 2, 3))
     if not known.any():
-        return unknown
-    still = known & during(recording.time_s, evidence.project.intervals_s.pre_event)[chosen]
-    rest = J[still].mean(axis=0) if still.any() else J[known][0]
-    sigma = np.sqrt(np.maximum(np.einsum("...u,uv,...v->...", J - rest, calibration.covariance, J - rest), 0.0))
-    moments = recording.time_s[chosen][known]
-    columns = [np.interp(recording.time_s, moments, column) for column in sigma[known].reshape(len(moments), -1).T]
-    every = np.stack(columns, axis=1).reshape(frames, len(targets), 2, 2)
-    return {target.name: every[:, number] for number, target in enumerate(targets)}
+        return np.full((len(time_s), 2, 2), np.nan)
+    rest = J[known & still].mean(axis=0) if (known & still).any() else J[known][0]
+    moved = J[known] - rest
+    sigma = np.sqrt(np.maximum(np.einsum("...u,uv,...v->...", moved, covariance, moved), 0.0))
+    columns = [np.interp(time_s, moments_s[known], column) for column in sigma.reshape(len(sigma), -1).T]
+    return np.stack(columns, axis=1).reshape(len(time_s), 2, 2)
 
 
 def _mean_seen(values: Floats) -> Floats:

@@ -57,9 +57,76 @@ def check_project(folder: Path, progress: Progress = silent, *, with_cloud: bool
         return _problems_of_file(file) or [str(error)]
     problems: list[str] = []
     inputs = _read_inputs(folder, project, problems, progress, with_cloud=with_cloud)
+    problems += [f"{file}: {problem}." for problem in obstacles(project, inputs.index, inputs.reference)]
     for check in (_video_problems, _correspondence_problems, _region_problems, _target_problems, _time_problems):
         problems += [f"{file}: {problem}." for problem in check(project, inputs)]
     return problems
+
+
+def obstacles(project: Project, index: FrameIndex | None, reference: ReferenceFit | None) -> Iterator[str]:
+    """Say what makes it useless to begin measuring, each with its place in the file and what to do.
+
+    Args:
+        index: of the video, where it can be read.
+        reference: the fit of the clicks, where there is one.
+    """
+    if not project.moving_regions_px:
+        yield "moving_regions_px: none, so the building would count as ground; outline all that moves"
+    if not project.targets:
+        yield "targets: none; add a roof with its search bands L1, L2 and T1"
+    if project.method == "geometric" and project.inputs.lens is None:
+        yield 'inputs.lens: missing, but method "geometric" needs it; calibrate with rooftrack lens, or choose "paper"'
+    for number, target in enumerate(project.targets):
+        height = _height_obstacle if project.method == "geometric" else _scale_obstacle
+        if (obstacle := height(project, target, reference)) is not None:
+            yield f"targets[{number}].{obstacle}"
+    if index is not None:
+        yield from _time_obstacles(project, index)
+
+
+def _height_obstacle(project: Project, target: Target, reference: ReferenceFit | None) -> str | None:
+    """Say what keeps `geometric` from knowing a target's plane."""
+    if target.height_m is None:
+        return f'height_m: missing, but method "geometric" needs the height of "{target.name}"; add it'
+    if reference is not None and reference.pose is not None and target.height_m >= reference.pose.centre_m[2]:
+        return (
+            f"height_m: {target.height_m:g}, but by the clicks the camera hovers {reference.pose.centre_m[2]:.1f} m "
+            "above the ground; correct the height, the clicks or the lens"
+        )
+    return None
+
+
+def _scale_obstacle(project: Project, target: Target, reference: ReferenceFit | None) -> str | None:
+    """Say what keeps `paper` from knowing a target's scale."""
+    if target.kind == "points":
+        return 'kind: "points", which method "paper" does not know; choose "geometric", or mark lines'
+    if target.p1_p2_m is None and (target.height_m is None or project.inputs.lens is None):
+        return (
+            'p1_p2_m: missing; "paper" takes its scale from the known distance P1-P2, or from height_m and a lens; '
+            "add one of them"
+        )
+    return None
+
+
+def _time_obstacles(project: Project, index: FrameIndex) -> Iterator[str]:
+    frames, times_s = len(index), index.time_s
+    if project.reference_frame >= frames:
+        yield f"reference_frame: is {project.reference_frame}, but the video ends with frame {frames - 1}; lower it"
+    for name, interval in project.intervals_s:
+        if interval is not None and not within(times_s, interval).any():
+            yield (
+                f"intervals_s.{name}: [{interval[0]:g}, {interval[1]:g}] holds no frame of the video, which lasts from "
+                f"0 to {times_s[-1]:.3f} s; correct it"
+            )
+    if project.drift.filter == "high-pass" and frames > 1:
+        corner_hz, nyquist_hz = project.drift.corner_hz, 0.5 / float(np.median(np.diff(times_s)))
+        if corner_hz >= nyquist_hz:
+            yield f"drift.corner_hz: {corner_hz:g} is not below {nyquist_hz:g} Hz, half the frame rate; lower it"
+        elif corner_hz * times_s[-1] < 0.5:
+            yield (
+                f"drift.corner_hz: {corner_hz:g}, but the video lasts {times_s[-1]:.1f} s, less than half a period; "
+                f"choose more than {0.5 / times_s[-1]:.2f} Hz"
+            )
 
 
 def _problems_of_file(file: Path) -> list[str]:
@@ -112,16 +179,12 @@ def _video_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
     if inputs.index is None:
         return
     frames = len(inputs.index)
-    if project.reference_frame >= frames:
-        yield f"reference_frame: is {project.reference_frame}, but the video ends with frame {frames - 1}; lower it"
     for number, (first, last) in enumerate(project.excluded_frames):
         if last >= frames:
             yield f"excluded_frames[{number}]: [{first}, {last}] ends after the last frame, {frames - 1}; shorten it"
 
 
 def _correspondence_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
-    if project.method == "geometric" and project.inputs.lens is None:
-        yield 'inputs.lens: missing, but method "geometric" needs it; calibrate with rooftrack lens, or choose "paper"'
     for pair in (pair for pair in project.correspondences if pair.enabled):
         if inputs.info and not _within_frame(pair.frame_px, inputs.info):
             u, v = pair.frame_px
@@ -143,8 +206,6 @@ def _within_cloud(place_m: tuple[float, float], cloud: Cloud) -> bool:
 
 
 def _region_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
-    if not project.moving_regions_px:
-        yield "moving_regions_px: none, so the building would count as ground; outline all that moves"
     for number, region in enumerate(project.moving_regions_px):
         if inputs.info and not _overlaps_frame(np.array(region), inputs.info):
             yield f"moving_regions_px[{number}]: lies wholly outside the frame; outline it again"
@@ -156,12 +217,8 @@ def _overlaps_frame(region_px: Floats, info: VideoInfo) -> bool:
 
 
 def _target_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
-    if not project.targets:
-        yield "targets: none; add a roof with its search bands L1, L2 and T1"
     for number, target in enumerate(project.targets):
         place = f"targets[{number}]"
-        if project.method == "geometric" and target.height_m is None:
-            yield f'{place}.height_m: missing, but method "geometric" needs the height of "{target.name}"; add it'
         if target.lines is not None and target.kind == "lines":
             yield from _line_problems(target.lines, place)
         for name, (x, y) in _corners(target):
@@ -216,19 +273,10 @@ def _time_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
     end_s = float(times_s[-1])
     # An interval may end with the last frame's own duration.
     last_s = end_s + float(np.median(np.diff(times_s))) if len(times_s) > 1 else end_s
-    for name in ("pre_event", "event", "residual"):
-        interval = getattr(project.intervals_s, name)
-        if interval and not (interval[0] >= 0 and interval[1] <= last_s):
+    for name, interval in project.intervals_s:
+        outside = interval is not None and not (interval[0] >= 0 and interval[1] <= last_s)
+        if interval is not None and outside and within(times_s, interval).any():
             yield (
                 f"intervals_s.{name}: [{interval[0]:g}, {interval[1]:g}] reaches outside the video, "
                 f"which lasts from 0 to {end_s:.3f} s; shorten it"
-            )
-        elif interval and not within(times_s, interval).any():
-            yield f"intervals_s.{name}: [{interval[0]:g}, {interval[1]:g}] holds no frame; lengthen it"
-    if project.drift.filter == "high-pass" and len(times_s) > 1:
-        nyquist_hz = 0.5 / float(np.median(np.diff(times_s)))
-        if project.drift.corner_hz >= nyquist_hz:
-            yield (
-                f"drift.corner_hz: {project.drift.corner_hz:g} is not below {nyquist_hz:g} Hz, half the frame rate; "
-                "lower it"
             )

@@ -51,7 +51,8 @@ class RigidFit:
         weight: (F, ...) final robust weights.
         normal: (F, 3, 3) normal matrix of (shift, rotation): the inverse of their covariance if points err
             independently.
-        sigma: (F, L) robust standard deviation of the residuals of each line, (F, 1) of points.
+        sigma: (F, L) robust standard deviation of the residuals of each line, nan where it is not seen; (F, 1) of
+            points.
     """
 
     shift: Floats
@@ -216,6 +217,7 @@ def rigid_from_lines(
             shift = shift + step
             continue
         sigma = np.maximum(1.4826 * _median(np.abs(masked), axis=-1), sigma_floor)
+        sigma[~seen.any(axis=-1)] = np.nan
         usual = np.maximum(_median(sigma, axis=0), sigma_floor)
         funnel = 3.0 if iteration < 4 else 1.0
         used = prior * biweight(masked, funnel * sigma[..., None])
@@ -353,18 +355,22 @@ def is_determined(normal: Floats, least_ratio: float = 1e-4) -> NDArray[np.bool_
     return np.asarray((ratio > least_ratio) & (np.diagonal(normal, axis1=1, axis2=2) > 0).all(axis=1))
 
 
-def is_determined_as_usual(normal: Floats, least_share: float = 0.1) -> NDArray[np.bool_]:
+def is_determined_as_whole(normal: Floats, whole: Floats, least_share: float = 0.1) -> NDArray[np.bool_]:
     """Return for each normal matrix (F, 3, 3) whether it fixes the motion, and in every direction not too weakly.
 
-    A line of which hardly anything is seen still makes the equations soluble; what they then say along the other lines
-    is worth nothing.
+    A line of which hardly anything is seen still makes the equations soluble, and so do two that are not quite
+    parallel; what they then say along the other lines is worth nothing.
 
     Args:
-        least_share: of the usual information on the weakest direction.
+        whole: (3, 3) of a frame in which the whole target is seen, with the usual noise.
+        least_share: of its information on the weakest direction.
     """
     determined = is_determined(normal)
-    if not determined.any():
-        return determined
     weakest = np.zeros(len(normal))
-    weakest[determined] = 1.0 / np.linalg.eigvalsh(np.linalg.inv(normal[determined])[:, :2, :2])[:, -1]
-    return np.asarray(determined & (weakest >= least_share * np.median(weakest[determined])))
+    weakest[determined] = _weakest_information(normal[determined])
+    return np.asarray(determined & (weakest >= least_share * _weakest_information(whole)))
+
+
+def _weakest_information(normal: Floats) -> Floats:
+    """Return what normal matrices (..., 3, 3) tell of the shift in the direction that they know least."""
+    return np.asarray(1.0 / np.linalg.eigvalsh(np.linalg.inv(normal)[..., :2, :2])[..., -1])

@@ -367,9 +367,10 @@ def _raw_of_rows(lens: Lens, H_und_ortho: Floats, grid: OrthoGrid, *, first: int
     u, v = np.meshgrid(np.arange(grid.width, dtype=np.float64), np.arange(first, last, dtype=np.float64))
     ortho = np.stack([u, v], axis=-1)
     raw = lens.distort(apply_homography(H_und_ortho, ortho))
-    # Behind the camera the homography comes out of the other side of the horizon.
-    ahead = ortho @ H_und_ortho[2, :2] + H_und_ortho[2, 2]
-    raw[ahead * np.sign(ahead[ahead.shape[0] // 2, ahead.shape[1] // 2]) <= 0] = np.nan
+    # Behind the camera the homography comes out of the other side of the horizon; what its axis meets lies ahead.
+    met = np.linalg.solve(H_und_ortho, np.append(lens.centre_px, 1.0))
+    ahead = (ortho @ H_und_ortho[2, :2] + H_und_ortho[2, 2]) * np.sign(met[2])
+    raw[ahead <= 0] = np.nan
     return raw
 
 

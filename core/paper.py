@@ -55,6 +55,8 @@ LEAST_STATIONS = 40
 
 # Places (M, 2) of features in raw pixels, their descriptors (M, 128), and the candidates for each expected feature.
 _Seen = tuple[Floats, NDArray[np.float32], list[NDArray[np.int64]]]
+# An edge along a band: its row, and the sign of the gradient across it.
+_Edge = tuple[float, float]
 
 
 class PaperMeasurer:
@@ -313,13 +315,13 @@ def canny_pairs(band: NDArray[np.uint8]) -> Floats:
     gradient = cv2.Sobel(smooth, cv2.CV_64F, 0, 1, ksize=3)
     rows, columns = band.shape
     found = np.full((columns, 2), np.nan)
-    typical = _pair_of(np.abs(np.where(edges, gradient, 0.0)).mean(axis=1), np.where(edges, gradient, 0.0).mean(axis=1))
+    typical = _pair_of(np.where(edges, gradient, 0.0).mean(axis=1))
     if typical is None:
         return found
     number = np.arange(rows)[:, None]
-    for side, place in enumerate(typical):
-        sign = np.sign(np.where(edges, gradient, 0.0).mean(axis=1)[round(place)])
-        near = edges & (np.abs(number - place) <= max(2.0, 0.35 * (typical[1] - typical[0]))) & (gradient * sign > 0)
+    reach = max(2.0, 0.35 * abs(typical[1][0] - typical[0][0]))
+    for side, (place, sign) in enumerate(typical):
+        near = edges & (np.abs(number - place) <= reach) & (gradient * sign > 0)
         row = np.where(near, np.abs(number - place), np.inf).argmin(axis=0)
         seen = near.any(axis=0) & (row > 0) & (row < rows - 1)
         column = np.flatnonzero(seen)
@@ -333,16 +335,21 @@ def canny_pairs(band: NDArray[np.uint8]) -> Floats:
     return found
 
 
-def _pair_of(strength: Floats, signed: Floats) -> tuple[float, float] | None:
-    """Return the rows of the two opposite edges that run along the whole band, nearest its middle."""
-    rows = len(strength)
-    pooled = np.convolve(signed, np.ones(3), mode="same")
+def _pair_of(gradient: Floats) -> tuple[_Edge, _Edge] | None:
+    """Return rows and signs of the two opposite edges that run along the whole band, nearest its middle.
+
+    Args:
+        gradient: (rows,) across the band, the mean of each row's edge pixels.
+    """
+    rows = len(gradient)
+    pooled = np.convolve(gradient, np.ones(3), mode="same")
     peaks = [
         r
         for r in range(1, rows - 1)
         if abs(pooled[r]) >= abs(pooled[r - 1]) and abs(pooled[r]) > abs(pooled[r + 1]) and abs(pooled[r]) > 8.0
     ]
-    middle, best, score = (rows - 1) / 2, None, 0.0
+    middle, score = (rows - 1) / 2, 0.0
+    best: tuple[_Edge, _Edge] | None = None
     for number, first in enumerate(peaks):
         for second in peaks[number + 1 :]:
             if pooled[first] * pooled[second] >= 0 or not 2 <= second - first <= 0.4 * rows:
@@ -351,7 +358,8 @@ def _pair_of(strength: Floats, signed: Floats) -> tuple[float, float] | None:
             value = min(abs(pooled[first]), abs(pooled[second])) * np.exp(-0.5 * offset**2)
             value /= 1.0 + ((second - first) / (0.3 * rows)) ** 2
             if value > score:
-                best, score = (float(first), float(second)), value
+                one, other = ((float(row), float(np.sign(pooled[row]))) for row in (first, second))
+                best, score = (one, other), value
     return best
 
 

@@ -14,13 +14,13 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from core.check import obstacles
 from core.cloud import Cloud, GroundPlane, fit_ground_plane, read_cloud
 from core.coordinates import Floats, invert_homography
 from core.errors import InputError
 from core.export import Results, write_results
 from core.georeference import ReferenceFit
 from core.ground_poses import fit_with_relief
-from core.intervals import within
 from core.lens import Lens, read_lens, require_image_size
 from core.locks import take_lock
 from core.measure import measure
@@ -28,7 +28,7 @@ from core.measurements import MeasurementStore
 from core.orthoimage import make_orthoimage, write_geotiff
 from core.prediction import MeasureSetup, video_identity
 from core.progress import CancelToken, Progress, silent
-from core.project import Project, read_project, write_atomically
+from core.project import PROJECT_FILE, Project, read_project, write_atomically
 from core.relief import Relief, rasterise
 from core.solve import solve
 from core.storage import File, file_at, opened, state_of
@@ -284,28 +284,8 @@ def _middle_of_targets(project: Project, otherwise: Floats) -> Floats:
 
 
 def _require_runnable(inputs: LoadedInputs) -> None:
-    project, file = inputs.project, inputs.folder / "project.json"
-    if not project.moving_regions_px:
-        raise InputError(f"{file}: moving_regions_px is empty; draw a polygon around the building and all that moves.")
-    if not project.targets:
-        raise InputError(f"{file}: targets is empty; mark a roof with three search bands, or a textured region.")
-    if project.method == "geometric" and not inputs.has_lens:
-        raise InputError(
-            f'{file}: inputs.lens is missing; method "geometric" needs it: calibrate with `rooftrack lens`, or choose '
-            'method "paper".'
-        )
-    frames = len(frame_index(inputs.video))
-    if project.reference_frame >= frames:
-        raise InputError(
-            f"{file}: reference_frame is {project.reference_frame}, the video's last frame is {frames - 1}; lower it."
-        )
-    time_s = frame_index(inputs.video).time_s
-    for name, interval in project.intervals_s:
-        if interval is not None and not within(time_s, interval).any():
-            raise InputError(
-                f"{file}: intervals_s.{name} is {list(interval)}, outside the video, which lasts from 0 to "
-                f"{time_s[-1]:.2f} s; correct it."
-            )
+    for obstacle in obstacles(inputs.project, frame_index(inputs.video), inputs.reference_fit()):
+        raise InputError(f"{inputs.folder / PROJECT_FILE}: {obstacle}.")
 
 
 def _frames_known(store: MeasurementStore, setup: MeasureSetup) -> int:

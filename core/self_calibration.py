@@ -132,8 +132,8 @@ def self_calibrate(
         parameters=parameters,
         correction=scaled * priors,
         sigma=np.sqrt(np.diag(covariance)),
-        rms_before_m=float(np.sqrt(np.nanmean((before.reshape(sigma_m.shape) * sigma_m) ** 2))),
-        rms_after_m=float(np.sqrt(np.nanmean((residual[: sigma_m.size].reshape(sigma_m.shape) * sigma_m) ** 2))),
+        rms_before_m=_rms_m(before, sigma_m, usable),
+        rms_after_m=_rms_m(residual[: sigma_m.size], sigma_m, usable),
         covariance=covariance,
     )
 
@@ -154,6 +154,11 @@ def _spread(own: Floats, usable: Bools) -> Floats:
     """Return the robust standard deviation (K,) of residuals (B, K) where they are used; 1 where none is."""
     spread = 1.4826 * finite_median(np.where(usable, np.abs(own), np.nan).T)
     return np.where(usable.any(axis=0), spread, 1.0)
+
+
+def _rms_m(own: Floats, sigma_m: Floats, usable: Bools) -> float:
+    """Return what residuals (B K,) in units of their noise (B, K) come to where they are used, metres."""
+    return float(np.sqrt(np.mean((own.reshape(sigma_m.shape)[usable] * sigma_m[usable]) ** 2)))
 
 
 def _huber(residual: Floats) -> Floats:

@@ -6,6 +6,7 @@ Everything here is relative to the local origin of the reference fit, with z = 0
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from core.ground_poses import fit_with_relief, solve_ground
 from core.intervals import during
 from core.lens import Lens
 from core.measurements import Recording
-from core.motion import RigidFit, is_determined, is_determined_as_usual
+from core.motion import RigidFit
 from core.project import Project, Target
 from core.relief import Relief
 from core.results import Status, TargetHistory
@@ -34,6 +35,8 @@ from core.uncertainty import GROUND_PART, Sigma, combined_sigma, common_error
 READOUT_FRAMES = 150
 # Change of the readout by which its effect is found, seconds: moves no point by more than a few pixels.
 READOUT_STEP_S = 1e-3
+# How far P1 and P2 may lie from their known distance: wrong by more are height, lens or bands, not the measurement.
+DISTANCE_TOLERANCE = 0.02
 
 
 def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: Relief | None = None) -> Solution:
@@ -46,9 +49,9 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
     Raises:
         InputError: the clicks, the lens or the heights do not do.
     """
-    heights = {target.name: _height_of(target) for target in project.targets}
     reference = fit_with_relief(project, lens, relief)
     assert reference.pose is not None
+    heights = {target.name: _height_of(target, reference.pose) for target in project.targets}
     start = Calibration(lens, reference.pose, heights)
     speed = ground_speed(recording, lens)
     readout = _readout(recording, speed, start, reference, relief)
@@ -81,17 +84,41 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
         self_calibration=calibration,
         flight=flight,
         readout=readout,
-        warnings=calibration.warnings,
+        warnings=(*calibration.warnings, *_warnings(project, targets, used.heights_m)),
     )
 
 
-def _height_of(target: Target) -> float:
+def _height_of(target: Target, camera: Pose) -> float:
     if target.height_m is None:
         raise InputError(
             f'project.json: targets.{target.name}.height_m is missing; "geometric" needs its height above '
             'the ground, "paper" does without.'
         )
+    if target.height_m >= camera.centre_m[2]:
+        raise InputError(
+            f"project.json: targets.{target.name}.height_m is {target.height_m:g}, but by the clicks the camera hovers "
+            f"{camera.centre_m[2]:.1f} m above the ground; correct the height, the clicks or the lens."
+        )
     return target.height_m
+
+
+def _warnings(project: Project, targets: Mapping[str, TargetSolution], heights_m: Mapping[str, float]) -> Iterator[str]:
+    """Say what about the targets cannot be right."""
+    for target in project.targets:
+        solved = targets[target.name]
+        distance_m = float(np.linalg.norm(np.subtract(*solved.rest_m)))
+        given_m = target.p1_p2_m
+        if given_m is not None and target.kind == "lines" and abs(distance_m / given_m - 1.0) > DISTANCE_TOLERANCE:
+            yield (
+                f"P1 and P2 of {target.name} lie {distance_m:.3f} m apart where it is {heights_m[target.name]:.2f} m "
+                f"high, but p1_p2_m is {given_m:.3f} m; check height_m, the lens and the bands."
+            )
+        still = during(solved.history.time_s, project.intervals_s.pre_event)
+        if project.intervals_s.pre_event is not None and not (still & solved.history.measured).any():
+            yield (
+                f"{target.name} was not measured in pre_event, so its displacement counts from the reference frame; "
+                "choose another pre_event."
+            )
 
 
 def _readout(
@@ -157,9 +184,7 @@ def _solve_target(
     still = during(recording.time_s, project.intervals_s.pre_event)
     fit = body.fit(points, still & ground.usable)
     used_points = (fit.weight > 0.1).reshape(len(fit.weight), -1).sum(axis=1)
-    # That the points of a textured roof scatter more than usual is no weakness: their standard deviation says it.
-    determined = is_determined(fit.normal) if body.lines is None else is_determined_as_usual(fit.normal)
-    status = frame_status(recording, project, ground, used_points, determined)
+    status = frame_status(recording, project, ground, used_points, body.is_determined(fit))
     apparent = world_points(midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, 0.0)
     flat = rest_body(recording, target.name, used.lens, used.pose0, 0.0)
     raw = flat.fit(apparent, np.zeros(len(apparent), dtype=bool))

@@ -77,6 +77,11 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
         (put([1.0, 5.0], "intervals_s", "residual"), "intervals_s.residual: [1, 5] reaches outside the video"),
         (put([0.51, 0.54], "intervals_s", "pre_event"), "intervals_s.pre_event: [0.51, 0.54] holds no frame"),
         (put({"filter": "high-pass", "corner_hz": 10}, "drift"), "drift.corner_hz: 10 is not below 10 Hz"),
+        (put({"filter": "high-pass", "corner_hz": 0.1}, "drift"), "less than half a period; choose more than 0.26 Hz"),
+        (
+            put(20, "targets", 0, "height_m"),
+            "height_m: 20, but by the clicks the camera hovers 15.0 m above",
+        ),
         (put(3, "wind"), 'wind: unknown key "wind"'),
     ],
 )
@@ -118,6 +123,23 @@ def test_paper_needs_neither_lens_nor_height(inputs: Path) -> None:
         document["targets"][0]["height_m"] = None
 
     assert problems(inputs, change) == []
+
+
+def test_paper_needs_lines_and_their_scale(inputs: Path) -> None:
+    def scaleless(document: dict[str, Any]) -> None:
+        document["method"] = "paper"
+        document["inputs"]["lens"] = None
+        document["targets"][0]["p1_p2_m"] = None
+
+    (line,) = problems(inputs, scaleless)
+    assert "targets[0].p1_p2_m: missing" in line
+
+    def patches(document: dict[str, Any]) -> None:
+        document["method"] = "paper"
+        document["targets"][0].update(kind="points", lines=None, region_m=[[-2, -2], [2, -2], [2, 2]])
+
+    (line,) = problems(inputs, patches)
+    assert 'targets[0].kind: "points", which method "paper" does not know' in line
 
 
 @pytest.mark.parametrize(("text", "told"), [("{", "line 1, column 2 is not valid JSON"), ("[]", "project.json: top:")])

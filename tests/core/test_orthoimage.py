@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from core.camera import Pose, plan_homography
 from core.cloud import Cloud, fit_ground_plane, make_cloud
 from core.coordinates import OrthoGrid, apply_homography
 from core.errors import InputError
@@ -188,6 +189,22 @@ def test_a_rectified_frame_lies_where_its_homography_says():
     assert (rectified[outside] == 0).all()
     grey, _ = rectify_frame(np.round(frame[..., 0]).astype(np.uint8), lens, H_plan_und, grid)
     np.testing.assert_array_equal(grey, rectified[..., 0])
+
+
+def test_nothing_is_drawn_behind_the_camera():
+    # 15 degrees below the horizon, 40 m up, looking north from the origin; the sky is white.
+    lens = Lens.ideal((960, 540), 600.0)
+    down = np.radians(15.0)
+    ahead, right = np.array([0.0, np.cos(down), -np.sin(down)]), np.array([1.0, 0.0, 0.0])
+    pose = Pose(np.stack([right, np.cross(ahead, right), ahead]), np.array([0.0, 0.0, 40.0]))
+    H_plan_und = plan_homography(pose) @ np.linalg.inv(lens.camera_matrix)
+    frame = np.full((540, 960), 100, np.uint8)
+    frame[: int(269.5 - 600 * np.tan(down))] = 255
+    # So many rows that they are drawn in several strips, some of them wholly behind the camera.
+    rectified, outside = rectify_frame(frame, lens, H_plan_und, OrthoGrid(-300.0, 600.0, 0.5, 1200, 2400))
+    assert outside[1200:].all()
+    assert not (rectified == 255).any()
+    assert (~outside[:1150]).mean() > 0.3
 
 
 def test_a_frame_shown_smaller_does_not_alias():

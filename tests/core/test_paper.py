@@ -23,6 +23,23 @@ def ground_picture(seed: int) -> np.ndarray:
     return np.clip(128 + 22 * picture, 0, 255).astype(np.uint8)
 
 
+@pytest.mark.parametrize("row", [17.0, 17.3, 17.5])
+@pytest.mark.parametrize("bright", [True, False])
+def test_both_edges_of_a_straight_strip_are_found(row: float, bright: bool) -> None:
+    # Edges that run along whole rows: beside the row of the strongest sum, where none of them lies, is its neighbour.
+    rows, width = np.arange(36.0)[:, None], 6.0
+    inside = np.clip(width / 2 + 0.5 - np.abs(rows - row), 0.0, 1.0)
+    band = np.repeat(100.0 + (90.0 if bright else -70.0) * inside, 60, axis=1)
+    pairs = paper.canny_pairs(np.rint(band).astype(np.uint8))
+    assert np.isfinite(pairs).all()
+    np.testing.assert_allclose(pairs[:, 1] - pairs[:, 0], width, atol=0.35)
+    np.testing.assert_allclose(pairs.mean(axis=1), row, atol=0.1)
+
+
+def test_a_band_without_a_strip_has_no_edges() -> None:
+    assert not np.isfinite(paper.canny_pairs(np.full((36, 60), 120, np.uint8))).any()
+
+
 def test_windows_find_the_matches_that_the_whole_frame_gives(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paper, "FEATURES", COUNT)
     luma = ground_picture(1)

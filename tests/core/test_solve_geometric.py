@@ -10,6 +10,7 @@ import pytest
 from core.calibration import LAG
 from core.camera import fit_poses
 from core.coordinates import Bools, Floats
+from core.errors import InputError
 from core.ground_poses import fit_with_relief, solve_ground
 from core.lens import Lens
 from core.measurements import Recording
@@ -98,6 +99,49 @@ def test_a_textured_roof_seen_roughly_is_measured_with_a_larger_standard_deviati
     usual = np.median(history.p1_sigma_m, axis=0)
     assert (history.p1_sigma_m[rough] > 2.0 * usual).all()
     assert (np.abs(history.p1_m[rough] - scene.truth().p1_m[rough]) < 4.0 * history.p1_sigma_m[rough] + 1e-3).all()
+
+
+# --- what cannot be right --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kept", [0, 3, 40])
+def test_two_lines_that_are_not_quite_parallel_fix_nothing(kept: int) -> None:
+    recording = scene.recording(NOISE_PX)
+    roof = recording.targets_raw["roof"].copy()
+    roof[kept:, 2] = np.nan
+    history = solved(replace(recording, targets_raw={"roof": roof})).histories["roof"]
+    assert (history.status[kept:] == Status.LOST).all()
+    assert np.isfinite(history.p1_sigma_m[history.measured]).all()
+
+
+def test_a_roof_above_the_camera_is_refused() -> None:
+    document = scene.project_document()
+    roof = {**document.targets[0].model_dump(by_alias=True), "height_m": 90.0}
+    with pytest.raises(InputError, match=r"height_m is 90, but by the clicks the camera hovers \d+\.\d m above"):
+        solved(scene.recording(), targets=[roof])
+
+
+def test_a_distance_that_is_not_the_known_one_is_told() -> None:
+    document = scene.project_document()
+    roof = document.targets[0].model_dump(by_alias=True)
+    distance_m = float(np.linalg.norm(np.subtract(*solved(scene.recording()).targets["roof"].rest_m)))
+    right, wrong = (
+        solved(scene.recording(), targets=[{**roof, "p1_p2_m": share * distance_m}]).warnings for share in (1.01, 1.05)
+    )
+    assert not any("p1_p2_m" in warning for warning in right)
+    assert any("P1 and P2 of roof lie" in warning and "check height_m, the lens" in warning for warning in wrong)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_pre_event_in_which_nothing_was_measured_is_told() -> None:
+    recording = scene.recording(NOISE_PX)
+    roof = recording.targets_raw["roof"].copy()
+    roof[recording.time_s < 2.95] = np.nan
+    solution = solved(replace(recording, targets_raw={"roof": roof}), intervals_s={"pre_event": [0.0, 2.9]})
+    assert any("roof was not measured in pre_event" in warning for warning in solution.warnings)
+    assert solution.self_calibration is not None
+    assert solution.self_calibration.refused == "no target was measured while the building stands still"
+    assert (solution.histories["roof"].status[recording.time_s > 3.0] == Status.OK).all()
 
 
 # --- steady features count more --------------------------------------------------------------------------------------
