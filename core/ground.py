@@ -27,6 +27,9 @@ ALIKE_SCORE = 0.15
 # In noise patches stay near where they are looked for: so many times they are looked for where they have been found, so
 # that nothing is left of the prediction and a chunk measured by itself equals an uninterrupted pass.
 NOISY_ROUNDS = 2
+# Where a prediction is no further off than this, every patch comes home from it; from further off in a few rounds.
+NEAR_PX = 1.5
+MOST_ROUNDS = 6
 # Ground points needed before a frame's homography is believed.
 LEAST_POINTS = 12
 # Widths of the reduced pictures in which features are chosen and a lost camera is found again, pixels.
@@ -211,17 +214,34 @@ class GroundTracker:
         """
         # A hovering camera may well see what it saw in the reference frame.
         expected = np.eye(3) if predicted_H_ray_ray0 is None else predicted_H_ray_ray0
-        found = self._refine(luma, expected, is_view=is_view)
+        found = self._settled(luma, expected, is_view=is_view)
         if found is not None and found.inliers >= max(LEAST_POINTS, len(self.patches) // 4):
-            for _ in range(NOISY_ROUNDS if self.patches.is_averaged else 0):
-                found = self._refine(luma, found.H_ray_ray0, is_view=is_view) or found
             return found
         searched = self._finder.search(luma)
-        if searched is None:
-            return None
-        coarse = self._refine(luma, searched, is_view=is_view)
-        # The search is good to a few pixels: a second pass from its result gets every patch home.
-        return self._refine(luma, coarse.H_ray_ray0, is_view=is_view) if coarse is not None else None
+        return None if searched is None else self._settled(luma, searched, is_view=is_view)
+
+    def _settled(self, luma: Luma, H_ray_ray0: Floats, *, is_view: bool) -> GroundMatch | None:
+        """Return the ground near where it is expected, or None where it comes to rest nowhere.
+
+        A patch that is looked for some pixels beside its place may stop on the way there. So all are looked for again
+        from where they have been found, until that is near where they were expected.
+        """
+        rounds = NOISY_ROUNDS if self.patches.is_averaged else 0
+        for _ in range(MOST_ROUNDS):
+            found = self._refine(luma, H_ray_ray0, is_view=is_view)
+            if found is None:
+                return None
+            near = self._apart_px(found.H_ray_ray0, H_ray_ray0) < NEAR_PX
+            if near and rounds == 0:
+                return found
+            rounds -= near
+            H_ray_ray0 = found.H_ray_ray0
+        return None
+
+    def _apart_px(self, one: Floats, other: Floats) -> float:
+        """Return the largest distance between where two homographies lead the features."""
+        apart = apply_homography(one, self._rays0) - apply_homography(other, self._rays0)
+        return float(np.abs(apart).max() * self._lens.focal_px.mean())
 
     def _refine(
         self, luma: Luma, H_ray_ray0: Floats, *, least_score: float | None = None, is_view: bool = False

@@ -131,7 +131,7 @@ class GeometricMeasurer:
     def measure(self, luma: Luma, *, frame: int, time_s: float, before: Sequence[FrameMeasurement]) -> FrameMeasurement:
         """Return what a frame shows; see `Measurer.measure`."""
         is_view = frame in self._views
-        ground = self._ground.find(luma, predict_homography(before), is_view=is_view)
+        ground = self._ground.find(luma, predict_homography(before, time_s), is_view=is_view)
         if ground is None:
             return nothing_measured(self.reference, frame, time_s)
         targets_raw, apparent = {}, {}

@@ -71,7 +71,7 @@ class PaperMeasurer:
 
     def measure(self, luma: Luma, *, frame: int, time_s: float, before: Sequence[FrameMeasurement]) -> FrameMeasurement:
         """Return what a frame shows; see `core.measure.Measurer`."""
-        found = self._ground.find(luma, predict_homography(before))
+        found = self._ground.find(luma, predict_homography(before, time_s))
         if found is None:
             return nothing_measured(self.reference, frame, time_s)
         H_ray_ray0, ground_raw = found

@@ -19,7 +19,9 @@ from core.project import Method, Target
 from core.storage import File, opened, state_of
 
 # Raised whenever the same video would be measured differently: older recordings are then not continued.
-MEASURE_VERSION = 4
+MEASURE_VERSION = 5
+# Over a longer gap nothing goes on as it was, and the last place is as good a guess as any.
+MOST_STEPS = 2.0
 # Bytes read at each of a video's places to tell it from another.
 SAMPLE_BYTES = 1 << 20
 
@@ -84,14 +86,15 @@ def nothing_measured(reference: Reference, frame: int, time_s: float) -> FrameMe
     )
 
 
-def predict_homography(before: Sequence[FrameMeasurement]) -> Floats | None:
-    """Return the camera's homography if it goes on turning and drifting as in the last two frames."""
+def predict_homography(before: Sequence[FrameMeasurement], time_s: float) -> Floats | None:
+    """Return the camera's homography at a time if it goes on turning and drifting as in the last two frames."""
     if not before or not np.isfinite(before[-1].H_ray_ray0).all():
         return None
     last = before[-1].H_ray_ray0
     if len(before) < 2 or not np.isfinite(before[-2].H_ray_ray0).all():
         return last
-    return np.asarray(last @ np.linalg.inv(before[-2].H_ray_ray0) @ last)
+    turn = np.linalg.inv(before[-2].H_ray_ray0) @ last
+    return np.asarray(last @ (np.eye(3) + _steps_ahead(before, time_s) * (turn / turn[2, 2] - np.eye(3))))
 
 
 def predict_apparent(before: Sequence[FrameMeasurement], name: str, time_s: float) -> Apparent | None:
@@ -100,5 +103,10 @@ def predict_apparent(before: Sequence[FrameMeasurement], name: str, time_s: floa
         return None
     if len(before) < 2 or (earlier := before[-2].apparent[name]) is None:
         return last
+    return last.towards(earlier, _steps_ahead(before, time_s))
+
+
+def _steps_ahead(before: Sequence[FrameMeasurement], time_s: float) -> float:
+    """Return how far a time lies behind the last frame, in steps from the frame before that one."""
     step_s = before[-1].time_s - before[-2].time_s
-    return last.towards(earlier, (time_s - before[-1].time_s) / step_s if step_s > 0 else 1.0)
+    return min((time_s - before[-1].time_s) / step_s, MOST_STEPS) if step_s > 0 else 1.0

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -206,6 +207,21 @@ def test_a_wrong_prediction_is_overcome() -> None:
     assert found is not None
     centre = apply_homography(found.H_ray_ray0, np.zeros((1, 2)))
     np.testing.assert_allclose(centre, apply_homography(true_homography(camera), np.zeros((1, 2))), atol=1e-3)
+
+
+@pytest.mark.parametrize("kick_px", [(1, 1), (2, 1), (3, -2), (-4, 3), (5, 5), (9, -6), (30, 20)])
+def test_a_kick_of_the_camera_leaves_no_patch_on_the_way(kick_px: tuple[int, int]) -> None:
+    # Fine texture, as of gravel, has many places that look alike a few pixels on.
+    gravel = np.random.default_rng(6).normal(size=SIZE[::-1])
+    still = frame(120 + 40 * cv2.GaussianBlur(gravel, (0, 0), 0.9) / 0.31)
+    lens = Lens.ideal(SIZE, 400.0)
+    points = choose_features(still, REGIONS, 80)
+    tracker = GroundTracker(still, points, lens, ground_mask(SIZE[::-1], REGIONS))
+    match = tracker.find(np.roll(still, kick_px[::-1], axis=(0, 1)), np.eye(3))
+    assert match is not None
+    off_px = np.linalg.norm(match.matches.raw - points - kick_px, axis=1)
+    assert np.nanmax(off_px) < 0.1
+    assert match.inliers > 0.8 * len(points)
 
 
 def test_noise_is_no_obstacle_on_the_way_ahead() -> None:
