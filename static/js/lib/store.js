@@ -14,8 +14,8 @@ import { ApiError, get, post, projectPath, put } from "./api.js";
  * @typedef {object} StoreEvents
  * @property {{project: Project, previous: Project, origin: "edit" | "saved" | "server" | "undo"}} change
  * @property {"saved" | "saving" | "failed"} saving
- * @property {{label: string, again: () => void}} conflict  another tab was faster; `again` repeats the edit on the newer state
- * @property {{label: string, error: unknown}} refused  the server found the edit wrong; it was taken back
+ * @property {{labels: string[], error: unknown, again: () => void}} lost  taken back for no fault of theirs: another tab was faster, or no answer came; `again` repeats them in order on the newest state
+ * @property {{label: string, error: unknown}} refused  the server found the edit wrong; it was taken back, those behind it go on
  */
 
 /** @extends {Emitter<StoreEvents>} */
@@ -96,7 +96,7 @@ export class ProjectStore extends Emitter {
       } catch (error) {
         if (!(error instanceof ApiError && error.status === 409)) throw error;
         await this.#reload();
-        this.emit("conflict", { label: which, again: () => void this.#step(which) });
+        this.emit("lost", { labels: [which], error, again: () => void this.#step(which) });
       }
     });
   }
@@ -108,20 +108,32 @@ export class ProjectStore extends Emitter {
   }
 
   /** @param {Edit} edit */
-  async #save({ label, change, merge }) {
+  async #save(edit) {
     this.emit("saving", "saving");
-    const project = changed(this.state.project, change);
+    const { label, merge } = edit;
+    const project = changed(this.state.project, edit.change);
+    let state;
     try {
-      const state = await put(projectPath(this.id), { project, revision: this.revision, label, merge });
-      this.#adopt({ ...this.state, ...state }, "saved");
-      this.emit("saving", "saved");
+      state = await put(projectPath(this.id), { project, revision: this.revision, label, merge });
     } catch (error) {
-      this.#waiting = [];
-      await this.#reload();
-      if (error instanceof ApiError && error.status === 409)
-        this.emit("conflict", { label, again: () => void this.edit(label, change) });
-      else this.emit("refused", { label, error });
+      return this.#takeBack(edit, error);
     }
+    this.#adopt({ ...this.state, ...state }, "saved");
+    this.emit("saving", "saved");
+  }
+
+  /** A wrong edit goes alone. Else those behind it go with it: they were made on a state that is shown no more. @param {Edit} edit @param {unknown} error */
+  async #takeBack(edit, error) {
+    const wrong = error instanceof ApiError && error.kind === "input";
+    const lost = wrong ? [edit] : [edit, ...this.#waiting.splice(0)];
+    await this.#reload();
+    if (wrong) this.emit("refused", { label: edit.label, error });
+    else this.emit("lost", { labels: lost.map(({ label }) => label), error, again: () => this.#repeat(lost) });
+  }
+
+  /** @param {Edit[]} edits */
+  #repeat(edits) {
+    for (const { label, change, merge } of edits) void this.edit(label, change, { merge });
   }
 
   async #reload() {
