@@ -206,6 +206,23 @@ def test_a_wrong_edit_takes_none_behind_it_along(browser, project):
     assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [6]
 
 
+def test_a_tab_that_is_saving_misses_no_edit_of_another(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as first, watched(browser, pages) as second:
+        first.goto(f"{pages}/correspondences"), second.goto(f"{pages}/correspondences")
+        ready(second, "Reference frame")
+        with first_answer_held(second, pages):
+            second.get_by_role("checkbox", name="Pair 5 counts").click()
+            expect(first.get_by_role("checkbox", name="Pair 5 counts")).not_to_be_checked()
+            first.get_by_role("checkbox", name="Pair 2 counts").click()
+            saved(first)
+            second.wait_for_timeout(2500)  # it is told of both edits, and of the changed file, before its own answer
+        expect(second.get_by_role("checkbox", name="Pair 2 counts")).not_to_be_checked()
+        second.get_by_role("checkbox", name="Pair 6 counts").click()  # no conflict: it stands on the newest state
+        expect(first.get_by_role("checkbox", name="Pair 6 counts")).not_to_be_checked()
+    assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [2, 5, 6]
+
+
 def of_project(pages: str) -> str:
     """Return where a project is asked for and saved, given the address of its pages."""
     return pages.replace("/p/", "/api/projects/")

@@ -25,6 +25,8 @@ export class ProjectStore extends Emitter {
   /** @type {Promise<void>} */
   #work = Promise.resolve();
   #busy = false;
+  /** Highest revision told of while busy; whether it is our own shows when the answer is here. */
+  #heard = 0;
 
   /** @param {ProjectState} state */
   constructor(state) {
@@ -80,7 +82,9 @@ export class ProjectStore extends Emitter {
 
   /** Told by the event stream that a revision exists. @param {number} revision */
   heardOf(revision) {
-    if (!this.#busy && revision !== this.revision) void this.refresh();
+    if (this.#busy) this.#heard = Math.max(this.#heard, revision);
+    else if (revision !== this.revision)
+      this.refresh().catch(() => undefined); // without a server the stream breaks too, and tells again
   }
 
   /** Resolves when nothing waits to be saved. @returns {Promise<void>} */
@@ -163,10 +167,18 @@ export class ProjectStore extends Emitter {
         await task();
       } finally {
         this.#busy = false;
+        this.#catchUp();
       }
     });
     this.#work = result.catch(() => undefined);
     return result;
+  }
+
+  /** Take what others saved while we were busy. Once only: a server that went back would never reach what was heard. */
+  #catchUp() {
+    const heard = this.#heard;
+    this.#heard = 0;
+    if (heard > this.revision) this.heardOf(heard);
   }
 }
 
