@@ -2,6 +2,7 @@
 
 import { h } from "../../lib/dom.js";
 import { clamp } from "../../lib/coordinates.js";
+import { markColour } from "../../components/palette.js";
 import { toastError } from "../../components/toast.js";
 
 /** @typedef {import("../../components/pane.js").Pane} Pane */
@@ -61,7 +62,7 @@ export function compareControls(pane, { load }) {
   pane.addPainter((context) => {
     if (mode !== "swipe" || pane.overlay === null) return;
     const x = pane.size[0] * pane.mix.amount;
-    context.fillStyle = "rgb(8 10 13 / 75%)";
+    context.fillStyle = markColour("--halo");
     context.fillRect(x - 1.5, 0, 3, pane.size[1]);
     context.fillStyle = "#ffffff";
     context.fillRect(x - 0.5, 0, 1, pane.size[1]);
