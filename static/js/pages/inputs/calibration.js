@@ -9,7 +9,7 @@ import { fixed, pixels, plural } from "../../lib/format.js";
 import { chooseFiles } from "../../components/file-browser.js";
 import { dialogActions, openDialog } from "../../components/dialog.js";
 import { numberField } from "../../components/number-field.js";
-import { sortableTable } from "../../components/table.js";
+import { SortableTable } from "../../components/table.js";
 import { toastError } from "../../components/toast.js";
 import { BoardView } from "./board-view.js";
 import { sendWithProgress } from "./input-card.js";
@@ -233,7 +233,7 @@ function show(element, projectId, report) {
 
 /** @param {(view: BoardImage) => void} onSelect */
 function viewsTable(onSelect) {
-  return sortableTable({
+  return new SortableTable({
     label: "Pictures of the board",
     id: (/** @type {BoardImage} */ view) => view.name,
     rowClass: (view) => (view.used ? "" : "off"),
