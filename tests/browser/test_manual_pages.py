@@ -223,6 +223,23 @@ def test_a_tab_that_is_saving_misses_no_edit_of_another(browser, project):
     assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [2, 5, 6]
 
 
+def test_a_number_being_typed_is_not_overwritten_by_another_tab(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as first, watched(browser, pages) as second:
+        first.goto(f"{pages}/correspondences?pair=3"), second.goto(f"{pages}/correspondences?pair=3")
+        ready(second, "Reference frame")
+        typed = second.get_by_label("east", exact=True)
+        typed.fill("2.5")
+        for label, value in (("east", "1.25"), ("north", "-3.75")):
+            first.get_by_label(label, exact=True).fill(value)
+            first.keyboard.press("Enter")
+        expect(second.get_by_label("north", exact=True)).to_have_value("-3.750")
+        expect(typed).to_have_value("2.5")
+        second.keyboard.press("Enter")
+        saved(second)
+    assert read_project(folder).correspondences[2].ground_m == (2.5, -3.75)
+
+
 def of_project(pages: str) -> str:
     """Return where a project is asked for and saved, given the address of its pages."""
     return pages.replace("/p/", "/api/projects/")

@@ -50,7 +50,7 @@ export function numberField(options) {
   const turn = (/** @type {number} */ steps) =>
     take(Math.min(max, Math.max(min, Number(((current ?? 0) + steps * step).toFixed(8)))));
   input.addEventListener("change", read);
-  input.addEventListener("blur", () => input.getAttribute("aria-invalid") === "true" && show());
+  input.addEventListener("blur", show); // after "change": what could not be used, or what came meanwhile
   input.addEventListener("keydown", (event) => {
     if (event.key === "Enter") read();
     if (event.key === "Escape") (show(), input.blur());
@@ -66,9 +66,9 @@ export function numberField(options) {
     /** Show another value, unless a person is typing. @param {number | null} value */
     set(value) {
       if (value === current) return;
+      const isTyping = document.activeElement === input && input.value !== written();
       current = value;
-      if (document.activeElement !== input || input.value === "") show();
-      else input.value = written();
+      if (!isTyping) show();
     },
   };
 }
