@@ -28,6 +28,7 @@ from tests.browser.steps import (
     ready,
     saved,
     tell_height,
+    to_step,
 )
 
 WITHIN_PX = 0.5
@@ -240,6 +241,25 @@ def test_a_number_being_typed_is_not_overwritten_by_another_tab(browser, project
     assert read_project(folder).correspondences[2].ground_m == (2.5, -3.75)
 
 
+def test_a_page_is_not_left_unasked_before_its_edits_are_saved(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        asked: list[str] = []
+        page.on("dialog", lambda dialog: (asked.append(dialog.type), dialog.dismiss()))
+        with first_answer_held(page, pages):
+            for pair in (5, 6):
+                page.get_by_role("checkbox", name=f"Pair {pair} counts").click()
+            to_step(page, "Regions")
+            assert arrived(page, asked) == "beforeunload"
+        saved(page)
+        to_step(page, "Regions")
+        page.wait_for_url("**/regions")
+    assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [5, 6]
+    assert len(asked) == 1
+
+
 def of_project(pages: str) -> str:
     """Return where a project is asked for and saved, given the address of its pages."""
     return pages.replace("/p/", "/api/projects/")
@@ -247,9 +267,11 @@ def of_project(pages: str) -> str:
 
 def arrived(page: Page, held: list):
     """Wait for what a page asks, and return it."""
-    while not held:
+    for _ in range(500):
+        if held:
+            return held[0]
         page.wait_for_timeout(20)
-    return held[0]
+    raise AssertionError("nothing came in time")
 
 
 @contextmanager

@@ -34,6 +34,7 @@ export async function openPage(step) {
     const events = new ServerEventStream(id);
     projectHeader(store, step);
     tellTroubles(store);
+    window.addEventListener("beforeunload", (event) => store.hasUnsaved && event.preventDefault());
     events.on("hello", ({ revision }) => store.heardOf(revision));
     events.on("project", ({ revision }) => store.heardOf(revision));
     for (const name of /** @type {const} */ (["inputs", "orthoimage", "results"]))

@@ -25,6 +25,8 @@ export class ProjectStore extends Emitter {
   /** @type {Promise<void>} */
   #work = Promise.resolve();
   #busy = false;
+  /** Edits that nobody answered for yet. */
+  #unsaved = 0;
   /** Highest revision told of while busy; whether it is our own shows when the answer is here. */
   #heard = 0;
 
@@ -42,6 +44,10 @@ export class ProjectStore extends Emitter {
 
   get id() {
     return this.state.id;
+  }
+
+  get hasUnsaved() {
+    return this.#unsaved > 0;
   }
 
   get revision() {
@@ -106,9 +112,11 @@ export class ProjectStore extends Emitter {
   }
 
   #saveAll() {
-    return this.#then(async () => {
+    this.#unsaved += 1;
+    const saving = this.#then(async () => {
       while (this.#waiting.length > 0) await this.#save(/** @type {Edit} */ (this.#waiting.shift()));
     });
+    return saving.finally(() => (this.#unsaved -= 1));
   }
 
   /** @param {Edit} edit */
