@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import APIResponse, Page, Route, expect
 
 from core.lens import read_lens
 from core.project import read_project
 from tests.browser.hands import centre_of, fitted, zoomed
-from tests.browser.live import SAMPLE, ask, ask_bytes, free_port, serving, watched
+from tests.browser.live import SAMPLE, ask, ask_bytes, eventually, free_port, serving, watched
 from tests.browser.steps import (
     FRAME_SIZE,
     draw_bands,
@@ -26,6 +28,7 @@ from tests.browser.steps import (
     ready,
     saved,
     tell_height,
+    to_step,
 )
 
 WITHIN_PX = 0.5
@@ -134,6 +137,151 @@ def test_a_second_tab_on_an_older_state_is_told_not_obeyed(browser, project):
         second.get_by_role("button", name="Do it again").click()
         expect(first.get_by_role("checkbox", name="Pair 5 counts")).not_to_be_checked()
     assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [2, 5]
+
+
+def test_all_edits_that_waited_behind_a_conflict_are_done_again(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as first, watched(browser, pages) as second:
+        second.route("**/events", lambda route: route.abort())
+        first.goto(f"{pages}/correspondences"), second.goto(f"{pages}/correspondences")
+        ready(second, "Reference frame")
+        first.get_by_role("checkbox", name="Pair 2 counts").click()
+        saved(first)
+        with first_answer_held(second, pages):
+            for pair in (5, 6, 7):
+                second.get_by_role("checkbox", name=f"Pair {pair} counts").click()
+        expect(second.get_by_role("alert")).to_contain_text("“Switch pair 5 off” and 2 more edits were not saved")
+        second.get_by_role("button", name="Do it again").click()
+        expect(first.get_by_role("checkbox", name="Pair 7 counts")).not_to_be_checked()
+    assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [2, 5, 6, 7]
+
+
+def test_nudges_done_again_are_still_one_step_of_undo(browser, project):
+    folder, pages = project
+    before = read_project(folder).correspondences[2].frame_px
+    with watched(browser, pages) as first, watched(browser, pages) as second:
+        second.route("**/events", lambda route: route.abort())
+        first.goto(f"{pages}/correspondences"), second.goto(f"{pages}/correspondences?pair=3")
+        ready(second, "Reference frame")
+        first.get_by_role("checkbox", name="Pair 2 counts").click()
+        saved(first)
+        pane(second, "Reference frame").focus()
+        with first_answer_held(second, pages):
+            for _ in range(3):
+                second.keyboard.press("ArrowRight")
+        second.get_by_role("button", name="Do it again").click()
+        after = (pytest.approx(before[0] + 0.3), before[1])
+        eventually(lambda: read_project(folder).correspondences[2].frame_px == after)
+        second.get_by_role("button", name="Undo: Nudge pair 3").click()
+        eventually(lambda: read_project(folder).correspondences[2].frame_px == before)
+
+
+def test_edits_of_a_tab_that_gets_no_answer_are_done_again(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        page.route(of_project(pages), lambda route: route.abort())
+        page.get_by_role("checkbox", name="Pair 4 counts").click()
+        expect(page.get_by_role("alert")).to_contain_text("does not answer")
+        page.unroute(of_project(pages))
+        page.get_by_role("button", name="Do it again").click()
+        expect(page.get_by_role("checkbox", name="Pair 4 counts")).not_to_be_checked()
+        saved(page)
+    assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [4]
+
+
+def test_a_wrong_edit_takes_none_behind_it_along(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        held: list[Route] = []
+        page.route(of_project(pages), lambda route: held.append(route), times=1)
+        for pair in (5, 6):
+            page.get_by_role("checkbox", name=f"Pair {pair} counts").click()
+        arrived(page, held).fulfill(status=422, json={"error": {"message": "Pair 5 is needed.", "kind": "input"}})
+        expect(page.get_by_role("alert")).to_have_text("“Switch pair 5 off” was not saved. Pair 5 is needed.")
+        expect(page.get_by_role("checkbox", name="Pair 5 counts")).to_be_checked()
+        saved(page)
+    assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [6]
+
+
+def test_a_tab_that_is_saving_misses_no_edit_of_another(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as first, watched(browser, pages) as second:
+        first.goto(f"{pages}/correspondences"), second.goto(f"{pages}/correspondences")
+        ready(second, "Reference frame")
+        with first_answer_held(second, pages):
+            second.get_by_role("checkbox", name="Pair 5 counts").click()
+            expect(first.get_by_role("checkbox", name="Pair 5 counts")).not_to_be_checked()
+            first.get_by_role("checkbox", name="Pair 2 counts").click()
+            saved(first)
+            second.wait_for_timeout(2500)  # it is told of both edits, and of the changed file, before its own answer
+        expect(second.get_by_role("checkbox", name="Pair 2 counts")).not_to_be_checked()
+        second.get_by_role("checkbox", name="Pair 6 counts").click()  # no conflict: it stands on the newest state
+        expect(first.get_by_role("checkbox", name="Pair 6 counts")).not_to_be_checked()
+    assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [2, 5, 6]
+
+
+def test_a_number_being_typed_is_not_overwritten_by_another_tab(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as first, watched(browser, pages) as second:
+        first.goto(f"{pages}/correspondences?pair=3"), second.goto(f"{pages}/correspondences?pair=3")
+        ready(second, "Reference frame")
+        typed = second.get_by_label("east", exact=True)
+        typed.fill("2.5")
+        for label, value in (("east", "1.25"), ("north", "-3.75")):
+            first.get_by_label(label, exact=True).fill(value)
+            first.keyboard.press("Enter")
+        expect(second.get_by_label("north", exact=True)).to_have_value("-3.750")
+        expect(typed).to_have_value("2.5")
+        second.keyboard.press("Enter")
+        saved(second)
+    assert read_project(folder).correspondences[2].ground_m == (2.5, -3.75)
+
+
+def test_a_page_is_not_left_unasked_before_its_edits_are_saved(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        asked: list[str] = []
+        page.on("dialog", lambda dialog: (asked.append(dialog.type), dialog.dismiss()))
+        with first_answer_held(page, pages):
+            for pair in (5, 6):
+                page.get_by_role("checkbox", name=f"Pair {pair} counts").click()
+            to_step(page, "Regions")
+            assert arrived(page, asked) == "beforeunload"
+        saved(page)
+        to_step(page, "Regions")
+        page.wait_for_url("**/regions")
+    assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [5, 6]
+    assert len(asked) == 1
+
+
+def of_project(pages: str) -> str:
+    """Return where a project is asked for and saved, given the address of its pages."""
+    return pages.replace("/p/", "/api/projects/")
+
+
+def arrived(page: Page, held: list):
+    """Wait for what a page asks, and return it."""
+    for _ in range(500):
+        if held:
+            return held[0]
+        page.wait_for_timeout(20)
+    raise AssertionError("nothing came in time")
+
+
+@contextmanager
+def first_answer_held(page: Page, pages: str) -> Iterator[None]:
+    """Have the server take the next edit of a page at once, and the page hear of it only when this ends."""
+    held: list[tuple[Route, APIResponse]] = []
+    page.route(of_project(pages), lambda route: held.append((route, route.fetch())), times=1)
+    yield
+    route, response = arrived(page, held)
+    route.fulfill(response=response)
 
 
 def test_clicks_on_the_undistorted_frame_are_stored_raw(browser, project):

@@ -18,8 +18,10 @@ const ICONS = /** @type {Record<string, import("../lib/icons.js").IconName>} */ 
 });
 const REMEMBERED = "rooftrack-browse-dir";
 
+/** @typedef {"video" | "cloud" | "lens" | "gps" | "image"} FileKind */
+
 /**
- * @param {{title: string, kind: "video" | "cloud" | "lens" | "gps" | "image", multiple?: boolean}} options
+ * @param {{title: string, kind: FileKind, multiple?: boolean}} options
  * @returns {Promise<string[] | null>} absolute paths
  */
 export function chooseFiles({ title, kind, multiple = false }) {
@@ -27,77 +29,110 @@ export function chooseFiles({ title, kind, multiple = false }) {
     title,
     size: "wide tall",
     body: (close) => {
-      const list = h("ul", {
-        class: "file-list",
-        role: "listbox",
-        "aria-label": "Files",
-        "aria-multiselectable": String(multiple),
-      });
-      const trail = h("nav", { class: "file-trail", "aria-label": "Folder" });
-      const note = h("p", { class: "soft small", role: "status" });
-      const choose = h("button", { class: "button primary", type: "button", disabled: true }, "Choose");
-      /** @type {Set<string>} */
-      const chosen = new Set();
-      const finish = () => chosen.size > 0 && close([...chosen]);
-      choose.addEventListener("click", finish);
-
-      const pick = (/** @type {HTMLElement} */ row, /** @type {string} */ path) => {
-        if (!multiple) chosen.clear();
-        if (chosen.has(path)) chosen.delete(path);
-        else chosen.add(path);
-        for (const item of list.children)
-          item.setAttribute("aria-selected", String(chosen.has(/** @type {HTMLElement} */ (item).dataset.path ?? "")));
-        choose.disabled = chosen.size === 0;
-        choose.textContent = chosen.size > 1 ? `Choose ${chosen.size} files` : "Choose";
-        row.focus();
-      };
-      const row = (/** @type {Entry} */ entry) => {
-        const element = h(
-          "li",
-          { role: "option", tabindex: 0, "aria-selected": "false", "data-path": entry.path },
-          icon(ICONS[entry.kind ?? ""] ?? (entry.is_dir ? "folder" : "file")),
-          h("span", { class: "name" }, entry.name),
-          h("span", { class: "faint number" }, entry.is_dir ? "" : size(entry.size)),
-        );
-        const open = () =>
-          entry.is_dir
-            ? void go(entry.path)
-            : multiple
-              ? pick(element, entry.path)
-              : (pick(element, entry.path), chosen.add(entry.path), finish());
-        element.addEventListener("click", () => (entry.is_dir ? open() : pick(element, entry.path)));
-        element.addEventListener("dblclick", () => !entry.is_dir && open());
-        element.addEventListener("keydown", (event) => onRowKey(event, element, open));
-        return element;
-      };
-      const go = async (/** @type {string | null} */ dir) => {
-        chosen.clear();
-        choose.disabled = true;
-        try {
-          const listing = /** @type {Listing} */ (
-            await get(`browse?kind=${kind}${dir === null ? "" : `&dir=${encodeURIComponent(dir)}`}`)
-          );
-          localStorage.setItem(REMEMBERED, listing.dir);
-          fill(
-            trail,
-            crumbs(listing, (path) => void go(path)),
-          );
-          fill(list, listing.entries.map(row));
-          note.textContent = listing.entries.length === 0 ? "Nothing of this kind here." : "";
-          /** @type {HTMLElement | null} */ (list.firstElementChild)?.focus();
-        } catch (error) {
-          if (dir !== null && list.children.length === 0) return go(null);
-          note.textContent = sentence(error);
-        }
-      };
-      void go(localStorage.getItem(REMEMBERED));
-      return [
-        h("div", { class: "dialog-body file-browser" }, trail, list, note),
-        dialogActions(() => close(null), choose),
-      ];
+      const browser = new FileBrowser(kind, multiple, close);
+      void browser.go(localStorage.getItem(REMEMBERED));
+      return [browser.element, dialogActions(() => close(null), browser.button)];
     },
   });
 }
+
+/** A folder at a time, with what is chosen in it. */
+class FileBrowser {
+  /** @type {Set<string>} */
+  #chosen = new Set();
+  #trail = h("nav", { class: "file-trail", "aria-label": "Folder" });
+  #note = h("p", { class: "soft small", role: "status" });
+
+  /** @param {FileKind} kind @param {boolean} multiple @param {(paths: string[]) => void} onChosen */
+  constructor(kind, multiple, onChosen) {
+    this.kind = kind;
+    this.multiple = multiple;
+    this.onChosen = onChosen;
+    this.list = h("ul", {
+      class: "file-list",
+      role: "listbox",
+      "aria-label": "Files",
+      "aria-multiselectable": String(multiple),
+    });
+    this.element = h("div", { class: "dialog-body file-browser" }, this.#trail, this.list, this.#note);
+    this.button = h(
+      "button",
+      { class: "button primary", type: "button", disabled: true, onclick: () => this.#finish() },
+      "Choose",
+    );
+  }
+
+  /** Show a folder; null is where the server begins. @param {string | null} dir @returns {Promise<void>} */
+  async go(dir) {
+    this.#chosen.clear();
+    this.button.disabled = true;
+    try {
+      const where = dir === null ? "" : `&dir=${encodeURIComponent(dir)}`;
+      this.#show(/** @type {Listing} */ (await get(`browse?kind=${this.kind}${where}`)));
+    } catch (error) {
+      if (dir !== null && this.list.children.length === 0) return this.go(null); // the folder of last time may be gone
+      this.#note.textContent = sentence(error);
+    }
+  }
+
+  /** @param {Listing} listing */
+  #show(listing) {
+    localStorage.setItem(REMEMBERED, listing.dir);
+    fill(
+      this.#trail,
+      crumbs(listing, (path) => void this.go(path)),
+    );
+    fill(this.list, listing.entries.map(this.#row, this));
+    this.#note.textContent = listing.entries.length === 0 ? "Nothing of this kind here." : "";
+    /** @type {HTMLElement | null} */ (this.list.firstElementChild)?.focus();
+  }
+
+  /** @param {Entry} entry */
+  #row(entry) {
+    const element = fileRow(entry);
+    const pick = () => this.#pick(element, entry.path);
+    const open = () => this.#open(element, entry);
+    element.addEventListener("click", entry.is_dir ? open : pick);
+    element.addEventListener("dblclick", () => !entry.is_dir && open());
+    element.addEventListener("keydown", (event) => onRowKey(event, element, open));
+    return element;
+  }
+
+  /** Enter a folder, or take a file; of many files each is picked, and the button takes them. @param {HTMLElement} element @param {Entry} entry */
+  #open(element, entry) {
+    if (entry.is_dir) return void this.go(entry.path);
+    this.#pick(element, entry.path);
+    if (!this.multiple) this.#finish();
+  }
+
+  /** @param {HTMLElement} element @param {string} path */
+  #pick(element, path) {
+    if (!this.multiple) this.#chosen.clear();
+    if (this.#chosen.has(path)) this.#chosen.delete(path);
+    else this.#chosen.add(path);
+    for (const item of this.list.children) {
+      const isChosen = this.#chosen.has(/** @type {HTMLElement} */ (item).dataset.path ?? "");
+      item.setAttribute("aria-selected", String(isChosen));
+    }
+    this.button.disabled = this.#chosen.size === 0;
+    this.button.textContent = this.#chosen.size > 1 ? `Choose ${this.#chosen.size} files` : "Choose";
+    element.focus();
+  }
+
+  #finish() {
+    if (this.#chosen.size > 0) this.onChosen([...this.#chosen]);
+  }
+}
+
+/** @param {Entry} entry */
+const fileRow = (entry) =>
+  h(
+    "li",
+    { role: "option", tabindex: 0, "aria-selected": "false", "data-path": entry.path },
+    icon(ICONS[entry.kind ?? ""] ?? (entry.is_dir ? "folder" : "file")),
+    h("span", { class: "name" }, entry.name),
+    h("span", { class: "faint number" }, entry.is_dir ? "" : size(entry.size)),
+  );
 
 /** @param {Listing} listing @param {(path: string) => void} go */
 function crumbs(listing, go) {

@@ -2,6 +2,7 @@
 
 import { h } from "../lib/dom.js";
 import { View } from "../lib/coordinates.js";
+import { markColour } from "./palette.js";
 
 /** @typedef {import("../lib/types.js").Point} Point */
 /** @typedef {import("./pane.js").Pane} Pane */
@@ -70,7 +71,7 @@ export class Loupe {
       if (shape.kind !== "mark" && shape.kind !== "handle") continue;
       const [x, y] = view.toCanvas(shape.points[0]);
       if (x < 0 || y < 0 || x > SIZE || y > SIZE) continue;
-      context.strokeStyle = shape.class?.includes("ghost") ? "#6fd0ff" : "#ffa62b";
+      context.strokeStyle = markColour(shape.class?.includes("ghost") ? "--mark-ghost" : "--mark");
       context.lineWidth = 1.5;
       context.beginPath();
       context.arc(x, y, 6, 0, 2 * Math.PI);
@@ -85,7 +86,7 @@ function drawCross(context, x, y) {
     `M${x - 60} ${y}H${x - 5}M${x + 5} ${y}H${x + 60}M${x} ${y - 60}V${y - 5}M${x} ${y + 5}V${y + 60}`,
   );
   context.lineWidth = 3;
-  context.strokeStyle = "rgb(8 10 13 / 70%)";
+  context.strokeStyle = markColour("--halo");
   context.stroke(arms);
   context.lineWidth = 1;
   context.strokeStyle = "#ffffff";

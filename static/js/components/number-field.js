@@ -23,84 +23,88 @@ let fields = 0;
 
 /** @param {NumberFieldOptions} options */
 export function numberField(options) {
-  const {
-    label,
-    unit,
-    onChange,
-    decimals = 2,
-    step = 10 ** -decimals,
-    min = -Infinity,
-    max = Infinity,
-    optional = false,
-  } = options;
-  const id = `number-${(fields += 1)}`;
-  const input = h("input", {
-    class: "input",
-    id,
-    type: "text",
-    inputmode: "decimal",
-    autocomplete: "off",
-    spellcheck: "false",
-    placeholder: options.placeholder ?? (optional ? "–" : ""),
-    "aria-label": options.bare ? `${label}${unit ? `, ${unit}` : ""}` : null,
-  });
-  const box = h(
-    "div",
-    { class: `number-field ${options.compact ? "compact" : ""}` },
-    input,
-    h("span", { class: "unit" }, unit),
-  );
-  const element = options.bare
-    ? box
-    : h(
-        "div",
-        { class: "field" },
-        h("label", { class: "label", for: id }, label),
-        box,
-        options.hint && h("p", { class: "hint" }, options.hint),
-      );
+  const { onChange, decimals = 2, step = 10 ** -decimals, min = -Infinity, max = Infinity, optional = false } = options;
+  const input = inputOf(options);
   let current = options.value;
 
+  const written = () => (current === null ? "" : current.toFixed(decimals));
   const show = () => {
-    input.value = current === null ? "" : current.toFixed(decimals);
+    input.value = written();
     input.removeAttribute("aria-invalid");
   };
   const take = (/** @type {number | null} */ value) => {
-    if (value === current) return show();
+    const isNew = value !== current;
     current = value;
     show();
-    onChange(value);
+    if (isNew) onChange(value);
   };
   const read = () => {
-    const text = input.value.trim().replace(",", ".").replace("\u2212", "-");
+    const text = plainNumber(input.value);
     if (text === "" && optional) return take(null);
     const value = Number(text);
     if (text === "" || !Number.isFinite(value) || value < min || value > max)
       return input.setAttribute("aria-invalid", "true");
-    if (current !== null && text === current.toFixed(decimals)) return show();
+    if (current !== null && text === written()) return show(); // as rounded for the eye: nothing was typed
     take(value);
   };
+  const turn = (/** @type {number} */ steps) =>
+    take(Math.min(max, Math.max(min, Number(((current ?? 0) + steps * step).toFixed(8)))));
   input.addEventListener("change", read);
-  input.addEventListener("blur", () => input.getAttribute("aria-invalid") === "true" && show());
+  input.addEventListener("blur", show); // after "change": what could not be used, or what came meanwhile
   input.addEventListener("keydown", (event) => {
-    const turn = event.key === "ArrowUp" ? 1 : event.key === "ArrowDown" ? -1 : 0;
     if (event.key === "Enter") read();
     if (event.key === "Escape") (show(), input.blur());
-    if (turn === 0) return;
+    const steps = stepsOf(event);
+    if (steps === 0) return;
     event.preventDefault();
-    const size = step * (event.shiftKey ? 10 : event.altKey ? 0.1 : 1);
-    take(Math.min(max, Math.max(min, Number(((current ?? 0) + turn * size).toFixed(8)))));
+    turn(steps);
   });
   show();
   return {
-    element,
+    element: framed(input, options),
     input,
     /** Show another value, unless a person is typing. @param {number | null} value */
     set(value) {
       if (value === current) return;
+      const isTyping = document.activeElement === input && input.value !== written();
       current = value;
-      if (document.activeElement !== input || input.value === "") show();
-      else input.value = current === null ? "" : current.toFixed(decimals);
+      if (!isTyping) show();
     },
   };
+}
+
+/** @param {NumberFieldOptions} options */
+function inputOf({ label, unit, placeholder, optional = false, bare = false }) {
+  return h("input", {
+    class: "input",
+    id: `number-${(fields += 1)}`,
+    type: "text",
+    inputmode: "decimal",
+    autocomplete: "off",
+    spellcheck: "false",
+    placeholder: placeholder ?? (optional ? "–" : ""),
+    "aria-label": bare ? `${label}${unit ? `, ${unit}` : ""}` : null,
+  });
+}
+
+/** With its unit, and with its label unless bare. @param {HTMLInputElement} input @param {NumberFieldOptions} options */
+function framed(input, { label, unit, compact, bare, hint }) {
+  const box = h("div", { class: `number-field ${compact ? "compact" : ""}` }, input, h("span", { class: "unit" }, unit));
+  if (bare) return box;
+  return h(
+    "div",
+    { class: "field" },
+    h("label", { class: "label", for: input.id }, label),
+    box,
+    hint && h("p", { class: "hint" }, hint),
+  );
+}
+
+/** As typed, with a comma or a long minus read as people mean them. @param {string} text */
+const plainNumber = (text) => text.trim().replace(",", ".").replace("\u2212", "-");
+
+/** @param {KeyboardEvent} event @returns {number} steps of an arrow key, upwards; 0 for other keys */
+function stepsOf({ key, shiftKey, altKey }) {
+  const way = key === "ArrowUp" ? 1 : key === "ArrowDown" ? -1 : 0;
+  return way * (shiftKey ? 10 : altKey ? 0.1 : 1);
 }

@@ -18,7 +18,8 @@ import { ProjectStore } from "../lib/store.js";
 import { ServerEventStream } from "../lib/events.js";
 import { bindKeys } from "../lib/keys.js";
 import { fill, find, h } from "../lib/dom.js";
-import { sentence } from "../lib/api.js";
+import { ApiError, sentence } from "../lib/api.js";
+import { plural } from "../lib/format.js";
 import { projectHeader, STEPS } from "./header.js";
 import { toast, toastError } from "./toast.js";
 
@@ -33,6 +34,7 @@ export async function openPage(step) {
     const events = new ServerEventStream(id);
     projectHeader(store, step);
     tellTroubles(store);
+    window.addEventListener("beforeunload", (event) => store.hasUnsaved && event.preventDefault());
     events.on("hello", ({ revision }) => store.heardOf(revision));
     events.on("project", ({ revision }) => store.heardOf(revision));
     for (const name of /** @type {const} */ (["inputs", "orthoimage", "results"]))
@@ -70,8 +72,8 @@ function historyKeys(store) {
 
 /** @param {ProjectStore} store */
 function tellTroubles(store) {
-  store.on("conflict", ({ label, again }) =>
-    toast(`“${label}” was not saved: another window has changed this project. You now see its newer state.`, {
+  store.on("lost", ({ labels, error, again }) =>
+    toast(`${these(labels)} not saved${whyLost(error)}`, {
       tone: "warn",
       seconds: 0,
       action: { label: "Do it again", run: again },
@@ -79,6 +81,16 @@ function tellTroubles(store) {
   );
   store.on("refused", ({ label, error }) => toast(`“${label}” was not saved. ${sentence(error)}`, { tone: "bad" }));
 }
+
+/** "“Nudge pair 3” and 2 more edits were" @param {string[]} labels */
+const these = ([first, ...rest]) =>
+  rest.length === 0 ? `“${first}” was` : `“${first}” and ${plural(rest.length, "more edit")} were`;
+
+/** @param {unknown} error */
+const whyLost = (error) =>
+  error instanceof ApiError && error.status === 409
+    ? ": another window has changed this project. You now see its newer state."
+    : `. ${sentence(error)}`;
 
 /** @param {string} message */
 function showDeadEnd(message) {

@@ -16,6 +16,20 @@ export function colourOf(element, name) {
   return colour;
 }
 
+/** @type {Map<string, string>} */
+const marks = new Map();
+
+/**
+ * Return a colour of marks on imagery. It is the same on any theme, so it is read once and may be asked for while drawing.
+ * @param {string} name for example "--mark"
+ * @returns {string}
+ */
+export function markColour(name) {
+  const colour = marks.get(name) ?? colourOf(document.body, name);
+  marks.set(name, colour);
+  return colour;
+}
+
 /**
  * Return a colour of `colourOf` with another opacity.
  * @param {string} colour

@@ -1,6 +1,6 @@
 // What the engine measured on a frame, drawn where it was measured: lines in SVG, hundreds of points on the canvas.
 
-import { colourOf } from "./palette.js";
+import { markColour } from "./palette.js";
 
 /** @typedef {import("../lib/types.js").Point} Point */
 /** @typedef {import("../lib/coordinates.js").View} View */
@@ -82,12 +82,11 @@ export class PointPainter {
 
   /** @param {import("./pane.js").Pane} pane */
   constructor(pane) {
-    const colour = (/** @type {string} */ name) => colourOf(pane.element, name);
     this.colours = {
-      used: colour("--ground-used"),
-      rejected: colour("--ground-rejected"),
-      edge: colour("--mark-selected"),
-      halo: colour("--halo"),
+      used: markColour("--ground-used"),
+      rejected: markColour("--ground-rejected"),
+      edge: markColour("--mark-selected"),
+      halo: markColour("--halo"),
     };
     pane.addPainter((context, view) => this.#paint(context, view));
   }

@@ -16,113 +16,140 @@ import { fill, h } from "../lib/dom.js";
 
 /**
  * @template Row
- * @param {object} options
- * @param {string} options.label
- * @param {Column<Row>[]} options.columns
- * @param {(row: Row) => string} options.id
- * @param {(row: Row) => void} [options.onSelect]
- * @param {(row: Row) => void} [options.onOpen]  Enter or double click
- * @param {(row: Row) => string} [options.rowClass]
- * @param {string} [options.empty]
+ * @typedef {object} TableOptions
+ * @property {string} label
+ * @property {Column<Row>[]} columns
+ * @property {(row: Row) => string} id
+ * @property {(row: Row) => void} [onSelect]
+ * @property {(row: Row) => void} [onOpen]  Enter or double click
+ * @property {(row: Row) => string} [rowClass]
+ * @property {string} [empty]
  */
-export function sortableTable({ label, columns, id, onSelect, onOpen, rowClass, empty = "Nothing yet." }) {
-  const head = h("tr");
-  const body = h("tbody");
-  const element = h("table", { class: "table", "aria-label": label }, h("thead", {}, head), body);
-  /** @type {Row[]} */
-  let rows = [];
-  /** @type {string | null} */
-  let selected = null;
-  /** @type {{key: string, down: boolean} | null} */
-  let order = null;
 
-  const sorted = () => {
-    const column = columns.find((entry) => entry.key === order?.key);
-    if (!column?.sort || order === null) return rows;
-    const { sort } = column;
+/** @template Row */
+export class SortableTable {
+  /** @type {Row[]} */
+  #rows = [];
+  /** @type {string | null} */
+  #selected = null;
+  /** @type {{key: string, down: boolean} | null} */
+  #order = null;
+  #head = h("tr");
+  #body = h("tbody");
+
+  /** @param {TableOptions<Row>} options */
+  constructor(options) {
+    this.options = options;
+    this.element = h("table", { class: "table", "aria-label": options.label }, h("thead", {}, this.#head), this.#body);
+    this.#body.addEventListener("keydown", (event) => this.#onKey(event));
+    this.#show();
+  }
+
+  /** Ids in the order shown. */
+  order() {
+    return this.#sorted().map(this.options.id);
+  }
+
+  /** @param {Row[]} rows */
+  setRows(rows) {
+    this.#rows = rows;
+    this.#show();
+  }
+
+  /** @param {string | null} key */
+  select(key) {
+    this.#selected = key;
+    for (const row of this.#body.querySelectorAll("tr[data-id]")) {
+      const on = /** @type {HTMLElement} */ (row).dataset.id === key;
+      row.setAttribute("aria-selected", String(on));
+      if (on) row.scrollIntoView({ block: "nearest" });
+    }
+  }
+
+  #sorted() {
+    const order = this.#order;
+    const sort = this.options.columns.find((column) => column.key === order?.key)?.sort;
+    if (sort === undefined || order === null) return this.#rows;
     const sign = order.down ? -1 : 1;
-    return [...rows].sort((a, b) => sign * compare(sort(a), sort(b), order?.down ?? false));
-  };
-  const toggle = (/** @type {string} */ key) => {
-    if (order?.key !== key) order = { key, down: true };
-    else if (order.down) order = { key, down: false };
-    else order = null;
-    show();
-  };
-  const show = () => {
-    const focused =
-      document.activeElement instanceof HTMLTableRowElement && body.contains(document.activeElement)
-        ? document.activeElement.dataset.id
-        : null;
+    return [...this.#rows].sort((a, b) => sign * compare(sort(a), sort(b), order.down));
+  }
+
+  /** Downwards first, then upwards, then as given. @param {string} key */
+  #turn(key) {
+    if (this.#order?.key !== key) this.#order = { key, down: true };
+    else this.#order = this.#order.down ? { key, down: false } : null;
+    this.#show();
+  }
+
+  #show() {
+    const { columns, empty = "Nothing yet." } = this.options;
+    const focused = this.#body.contains(document.activeElement) ? keyOf(document.activeElement) : null;
     fill(
-      head,
-      columns.map((column) => heading(column, order, toggle)),
+      this.#head,
+      columns.map((column) => heading(column, this.#order, (key) => this.#turn(key))),
     );
-    if (rows.length === 0) return fill(body, h("tr", { class: "empty" }, h("td", { colspan: columns.length }, empty)));
-    fill(
-      body,
-      sorted().map((row) => tableRow(row)),
-    );
+    if (this.#rows.length === 0)
+      fill(this.#body, h("tr", { class: "empty" }, h("td", { colspan: columns.length }, empty)));
+    else
+      fill(
+        this.#body,
+        this.#sorted().map((row) => this.#tableRow(row)),
+      );
     if (focused)
-      /** @type {HTMLElement | null} */ (body.querySelector(`tr[data-id="${CSS.escape(focused)}"]`))?.focus();
-  };
-  const tableRow = (/** @type {Row} */ row) => {
+      /** @type {HTMLElement | null} */ (this.#body.querySelector(`tr[data-id="${CSS.escape(focused)}"]`))?.focus();
+  }
+
+  /** @param {Row} row */
+  #tableRow(row) {
+    const { columns, id, rowClass, onSelect, onOpen } = this.options;
     const key = id(row);
-    const cells = columns.map((column) =>
-      h("td", { class: `${column.number ? "number" : ""} ${column.tone?.(row) ?? ""}` }, column.cell(row)),
-    );
     return h(
       "tr",
       {
         "data-id": key,
         tabindex: 0,
         class: rowClass?.(row) ?? "",
-        "aria-selected": key === selected ? "true" : "false",
+        "aria-selected": key === this.#selected ? "true" : "false",
         onclick: () => onSelect?.(row),
         ondblclick: () => onOpen?.(row),
       },
-      cells,
+      columns.map((column) =>
+        h("td", { class: `${column.number ? "number" : ""} ${column.tone?.(row) ?? ""}` }, column.cell(row)),
+      ),
     );
-  };
-  body.addEventListener("keydown", (event) => {
-    if (!(event.target instanceof HTMLTableRowElement)) return;
-    const row = rows.find((entry) => id(entry) === /** @type {HTMLElement} */ (event.target).dataset.id);
-    const next =
-      event.key === "ArrowDown"
-        ? event.target.nextElementSibling
-        : event.key === "ArrowUp"
-          ? event.target.previousElementSibling
-          : null;
+  }
+
+  /** @param {KeyboardEvent} event */
+  #onKey(event) {
+    const { onSelect, onOpen } = this.options;
+    const row = this.#rowOf(event.target);
+    const next = neighbour(event);
     if (next instanceof HTMLElement) {
       event.preventDefault();
       next.focus();
-      const moved = rows.find((entry) => id(entry) === next.dataset.id);
+      const moved = this.#rowOf(next);
       if (moved) onSelect?.(moved);
     } else if (event.key === "Enter" && row) {
       event.preventDefault();
       (onOpen ?? onSelect)?.(row);
     }
-  });
-  show();
-  return {
-    element,
-    /** Ids in the order shown. */
-    order: () => sorted().map(id),
-    /** @param {Row[]} newRows */
-    setRows(newRows) {
-      rows = newRows;
-      show();
-    },
-    /** @param {string | null} key */
-    select(key) {
-      selected = key;
-      for (const row of body.querySelectorAll("tr[data-id]")) {
-        const on = /** @type {HTMLElement} */ (row).dataset.id === key;
-        row.setAttribute("aria-selected", String(on));
-        if (on) row.scrollIntoView({ block: "nearest" });
-      }
-    },
-  };
+  }
+
+  /** @param {EventTarget | null} element */
+  #rowOf(element) {
+    const key = keyOf(element);
+    return this.#rows.find((row) => this.options.id(row) === key);
+  }
+}
+
+/** Id of the row that an element is; none for what is inside of one. @param {EventTarget | null} element */
+const keyOf = (element) => (element instanceof HTMLTableRowElement ? element.dataset.id : undefined);
+
+/** The row above or below, for the arrow keys. @param {KeyboardEvent} event */
+function neighbour({ key, target }) {
+  if (!(target instanceof HTMLTableRowElement)) return null;
+  if (key === "ArrowDown") return target.nextElementSibling;
+  return key === "ArrowUp" ? target.previousElementSibling : null;
 }
 
 /** @param {Column<any>} column @param {{key: string, down: boolean} | null} order @param {(key: string) => void} toggle */

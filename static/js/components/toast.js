@@ -33,8 +33,8 @@ export function toast(message, { tone = "info", action, seconds = tone === "bad"
     ),
   );
   tray.append(element);
-  while (tray.children.length > 4) tray.firstElementChild?.remove();
   if (seconds > 0) hideAfter(element, seconds);
+  makeRoom();
   return close;
 }
 
@@ -49,8 +49,15 @@ export function announce(message) {
   voice.textContent = message;
 }
 
+/** Not by taking away what waits for an answer, such as edits to do again. */
+function makeRoom() {
+  const passing = tray.querySelectorAll(".toast[data-passing]");
+  for (let i = 0; i < passing.length && tray.children.length > 4; i++) passing[i].remove();
+}
+
 /** Wait while the pointer rests on it. @param {HTMLElement} element @param {number} seconds */
 function hideAfter(element, seconds) {
+  element.dataset.passing = "";
   let timer = window.setTimeout(() => element.remove(), seconds * 1000);
   element.addEventListener("pointerenter", () => window.clearTimeout(timer));
   element.addEventListener("pointerleave", () => (timer = window.setTimeout(() => element.remove(), 3000)));

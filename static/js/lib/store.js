@@ -14,8 +14,8 @@ import { ApiError, get, post, projectPath, put } from "./api.js";
  * @typedef {object} StoreEvents
  * @property {{project: Project, previous: Project, origin: "edit" | "saved" | "server" | "undo"}} change
  * @property {"saved" | "saving" | "failed"} saving
- * @property {{label: string, again: () => void}} conflict  another tab was faster; `again` repeats the edit on the newer state
- * @property {{label: string, error: unknown}} refused  the server found the edit wrong; it was taken back
+ * @property {{labels: string[], error: unknown, again: () => void}} lost  taken back for no fault of theirs: another tab was faster, or no answer came; `again` repeats them in order on the newest state
+ * @property {{label: string, error: unknown}} refused  the server found the edit wrong; it was taken back, those behind it go on
  */
 
 /** @extends {Emitter<StoreEvents>} */
@@ -25,6 +25,10 @@ export class ProjectStore extends Emitter {
   /** @type {Promise<void>} */
   #work = Promise.resolve();
   #busy = false;
+  /** Edits that nobody answered for yet. */
+  #unsaved = 0;
+  /** Highest revision told of while busy; whether it is our own shows when the answer is here. */
+  #heard = 0;
 
   /** @param {ProjectState} state */
   constructor(state) {
@@ -40,6 +44,10 @@ export class ProjectStore extends Emitter {
 
   get id() {
     return this.state.id;
+  }
+
+  get hasUnsaved() {
+    return this.#unsaved > 0;
   }
 
   get revision() {
@@ -80,7 +88,9 @@ export class ProjectStore extends Emitter {
 
   /** Told by the event stream that a revision exists. @param {number} revision */
   heardOf(revision) {
-    if (!this.#busy && revision !== this.revision) void this.refresh();
+    if (this.#busy) this.#heard = Math.max(this.#heard, revision);
+    else if (revision !== this.revision)
+      this.refresh().catch(() => undefined); // without a server the stream breaks too, and tells again
   }
 
   /** Resolves when nothing waits to be saved. @returns {Promise<void>} */
@@ -96,32 +106,46 @@ export class ProjectStore extends Emitter {
       } catch (error) {
         if (!(error instanceof ApiError && error.status === 409)) throw error;
         await this.#reload();
-        this.emit("conflict", { label: which, again: () => void this.#step(which) });
+        this.emit("lost", { labels: [which], error, again: () => void this.#step(which) });
       }
     });
   }
 
   #saveAll() {
-    return this.#then(async () => {
+    this.#unsaved += 1;
+    const saving = this.#then(async () => {
       while (this.#waiting.length > 0) await this.#save(/** @type {Edit} */ (this.#waiting.shift()));
     });
+    return saving.finally(() => (this.#unsaved -= 1));
   }
 
   /** @param {Edit} edit */
-  async #save({ label, change, merge }) {
+  async #save(edit) {
     this.emit("saving", "saving");
-    const project = changed(this.state.project, change);
+    const { label, merge } = edit;
+    const project = changed(this.state.project, edit.change);
+    let state;
     try {
-      const state = await put(projectPath(this.id), { project, revision: this.revision, label, merge });
-      this.#adopt({ ...this.state, ...state }, "saved");
-      this.emit("saving", "saved");
+      state = await put(projectPath(this.id), { project, revision: this.revision, label, merge });
     } catch (error) {
-      this.#waiting = [];
-      await this.#reload();
-      if (error instanceof ApiError && error.status === 409)
-        this.emit("conflict", { label, again: () => void this.edit(label, change) });
-      else this.emit("refused", { label, error });
+      return this.#takeBack(edit, error);
     }
+    this.#adopt({ ...this.state, ...state }, "saved");
+    this.emit("saving", "saved");
+  }
+
+  /** A wrong edit goes alone. Else those behind it go with it: they were made on a state that is shown no more. @param {Edit} edit @param {unknown} error */
+  async #takeBack(edit, error) {
+    const wrong = error instanceof ApiError && error.kind === "input";
+    const lost = wrong ? [edit] : [edit, ...this.#waiting.splice(0)];
+    await this.#reload();
+    if (wrong) this.emit("refused", { label: edit.label, error });
+    else this.emit("lost", { labels: lost.map(({ label }) => label), error, again: () => this.#repeat(lost) });
+  }
+
+  /** @param {Edit[]} edits */
+  #repeat(edits) {
+    for (const { label, change, merge } of edits) void this.edit(label, change, { merge });
   }
 
   async #reload() {
@@ -151,10 +175,18 @@ export class ProjectStore extends Emitter {
         await task();
       } finally {
         this.#busy = false;
+        this.#catchUp();
       }
     });
     this.#work = result.catch(() => undefined);
     return result;
+  }
+
+  /** Take what others saved while we were busy. Once only: a server that went back would never reach what was heard. */
+  #catchUp() {
+    const heard = this.#heard;
+    this.#heard = 0;
+    if (heard > this.revision) this.heardOf(heard);
   }
 }
 

@@ -2,6 +2,7 @@
 
 import { h } from "../../lib/dom.js";
 import { clamp } from "../../lib/coordinates.js";
+import { markColour } from "../../components/palette.js";
 import { toastError } from "../../components/toast.js";
 
 /** @typedef {import("../../components/pane.js").Pane} Pane */
@@ -12,15 +13,7 @@ import { toastError } from "../../components/toast.js";
 export function compareControls(pane, { load }) {
   /** @type {Mode} */
   let mode = "off";
-  const slider = h("input", {
-    type: "range",
-    min: 0,
-    max: 1,
-    step: 0.01,
-    value: 0.5,
-    "aria-label": "Share of the orthorectified frame",
-    hidden: true,
-  });
+  const slider = shareSlider();
   const buttons = /** @type {Mode[]} */ (["off", "blend", "swipe"]).map((name) =>
     h(
       "button",
@@ -59,12 +52,7 @@ export function compareControls(pane, { load }) {
     }
   };
   pane.addPainter((context) => {
-    if (mode !== "swipe" || pane.overlay === null) return;
-    const x = pane.size[0] * pane.mix.amount;
-    context.fillStyle = "rgb(8 10 13 / 75%)";
-    context.fillRect(x - 1.5, 0, 3, pane.size[1]);
-    context.fillStyle = "#ffffff";
-    context.fillRect(x - 0.5, 0, 1, pane.size[1]);
+    if (mode === "swipe" && pane.overlay !== null) drawEdge(context, pane.size[0] * pane.mix.amount, pane.size[1]);
   });
   return {
     element,
@@ -78,4 +66,23 @@ export function compareControls(pane, { load }) {
     /** After a saved edit the frame is rectified anew. */
     refresh: () => void refresh(),
   };
+}
+
+const shareSlider = () =>
+  h("input", {
+    type: "range",
+    min: 0,
+    max: 1,
+    step: 0.01,
+    value: 0.5,
+    "aria-label": "Share of the orthorectified frame",
+    hidden: true,
+  });
+
+/** Where one picture ends and the other begins, canvas px. @param {CanvasRenderingContext2D} context @param {number} x @param {number} height */
+function drawEdge(context, x, height) {
+  context.fillStyle = markColour("--halo");
+  context.fillRect(x - 1.5, 0, 3, height);
+  context.fillStyle = "#ffffff";
+  context.fillRect(x - 0.5, 0, 1, height);
 }

@@ -2,7 +2,7 @@
 
 import { h } from "../../lib/dom.js";
 import { centimetres, pixels } from "../../lib/format.js";
-import { sortableTable } from "../../components/table.js";
+import { SortableTable } from "../../components/table.js";
 
 /** @typedef {import("../../lib/types.js").Point} Point */
 /** @typedef {import("../../lib/types.js").Correspondence} Correspondence */
@@ -36,7 +36,7 @@ export function pairsTable(element, { onSelect, onToggle }) {
   };
   const residualHint = "Distance between the click and where all pairs together put it";
   const leftOutHint = "Error of this pair when the fit does not use it: a bad click stands out here";
-  const table = sortableTable({
+  const table = new SortableTable({
     label: "Pairs",
     empty: "Click a place in either picture, then the same place in the other.",
     id: (/** @type {Correspondence} */ pair) => String(pair.id),

@@ -15,30 +15,15 @@ const FIELDS = /** @type {const} */ ([
   { side: "ground_m", axis: 1, label: "north", unit: "m", decimals: 3, step: 0.01 },
 ]);
 
+/** @returns {Record<Side, [number | null, number | null]>} */
+const nothingTyped = () => ({ frame_px: [null, null], ground_m: [null, null] });
+
 /** @param {HTMLElement} element @param {Slots} slots @param {{goTo: (id: number) => void}} options */
 export function selectionPanel(element, slots, { goTo }) {
   const title = h("h2");
   const on = h("input", { type: "checkbox" });
-  const zoom = h(
-    "button",
-    {
-      class: "button quiet small icon-only",
-      type: "button",
-      "aria-label": "Zoom to this pair (G)",
-      title: "Zoom to this pair (G)",
-    },
-    icon("target"),
-  );
-  const remove = h(
-    "button",
-    {
-      class: "button quiet small icon-only danger",
-      type: "button",
-      "aria-label": "Delete this pair (Delete)",
-      title: "Delete this pair (Delete)",
-    },
-    icon("trash"),
-  );
+  const zoom = iconButton("target", "Zoom to this pair (G)");
+  const remove = iconButton("trash", "Delete this pair (Delete)", "danger");
   const fields = FIELDS.map((field) =>
     numberField({
       ...field,
@@ -48,8 +33,8 @@ export function selectionPanel(element, slots, { goTo }) {
       onChange: (value) => type(field.side, field.axis, value),
     }),
   );
-  /** Typed coordinates whose other axis is still empty. @type {Record<Side, [number | null, number | null]>} */
-  let typed = { frame_px: [null, null], ground_m: [null, null] };
+  /** Typed coordinates whose other axis is still empty. */
+  let typed = nothingTyped();
   let shown = /** @type {number | undefined} */ (undefined);
   fill(
     element,
@@ -79,7 +64,7 @@ export function selectionPanel(element, slots, { goTo }) {
     /** Always there, also for no pair: the table below must not move under a double click. */
     show() {
       const now = entry();
-      if (shown !== now?.id) typed = { frame_px: [null, null], ground_m: [null, null] };
+      if (shown !== now?.id) typed = nothingTyped();
       shown = now?.id;
       const pair = slots.pairs.find((candidate) => candidate.id === now?.id);
       title.textContent =
@@ -91,3 +76,11 @@ export function selectionPanel(element, slots, { goTo }) {
     },
   };
 }
+
+/** @param {import("../../lib/icons.js").IconName} glyph @param {string} words @param {string} [tone] */
+const iconButton = (glyph, words, tone = "") =>
+  h(
+    "button",
+    { class: `button quiet small icon-only ${tone}`, type: "button", "aria-label": words, title: words },
+    icon(glyph),
+  );

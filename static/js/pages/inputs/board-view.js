@@ -5,6 +5,7 @@ import { projectPath } from "../../lib/api.js";
 import { Pane } from "../../components/pane.js";
 import { PaneImage } from "../../components/pane-image.js";
 import { paneChrome } from "../../components/pane-chrome.js";
+import { markColour } from "../../components/palette.js";
 import { plural } from "../../lib/format.js";
 
 /** @typedef {import("./calibration.js").BoardImage} BoardImage */
@@ -59,12 +60,12 @@ async function blank([width, height]) {
 /** @param {CanvasRenderingContext2D} context @param {Point[]} corners canvas px */
 function drawChain(context, corners) {
   context.lineWidth = 1;
-  context.strokeStyle = "#6fd0ff";
+  context.strokeStyle = markColour("--mark-ghost");
   context.beginPath();
   corners.forEach(([x, y], i) => (i === 0 ? context.moveTo(x, y) : context.lineTo(x, y)));
   context.stroke();
   corners.forEach(([x, y], i) => {
-    context.fillStyle = i === 0 ? "#fff04a" : "#ffa62b";
+    context.fillStyle = markColour(i === 0 ? "--mark-selected" : "--mark");
     context.beginPath();
     context.arc(x, y, i === 0 ? 4 : 2.4, 0, 2 * Math.PI);
     context.fill();

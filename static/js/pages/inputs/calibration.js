@@ -9,7 +9,7 @@ import { fixed, pixels, plural } from "../../lib/format.js";
 import { chooseFiles } from "../../components/file-browser.js";
 import { dialogActions, openDialog } from "../../components/dialog.js";
 import { numberField } from "../../components/number-field.js";
-import { sortableTable } from "../../components/table.js";
+import { SortableTable } from "../../components/table.js";
 import { toastError } from "../../components/toast.js";
 import { BoardView } from "./board-view.js";
 import { sendWithProgress } from "./input-card.js";
@@ -41,142 +41,152 @@ export function calibrationDialog(projectId) {
     title: "Calibrate the lens",
     size: "wide",
     body: (close) => {
-      const list = h("ul", { class: "board-images" });
-      const transfer = h("div");
+      const board = boardFields();
+      const pictures = new BoardPictures(projectId);
       const problem = h("p", { class: "note bad", role: "alert", hidden: true });
-      const start = h("button", { class: "button primary", type: "button" }, "Calibrate");
-      /** @type {string[] | null} paths on this computer; null: the pictures sent */
-      let chosen = null;
-      let square_m = /** @type {number | null} */ (0.025);
-      let columns = 9;
-      let rows = 6;
-      const size = numberField({
-        label: "Square",
-        unit: "m",
-        value: square_m,
-        decimals: 4,
-        step: 0.001,
-        min: 0.0001,
-        onChange: (value) => (square_m = value),
-      });
-      const across = numberField({
-        label: "Inner corners, long side",
-        unit: "",
-        value: columns,
-        decimals: 0,
-        step: 1,
-        min: 3,
-        onChange: (value) => (columns = value ?? columns),
-      });
-      const down = numberField({
-        label: "short side",
-        unit: "",
-        value: rows,
-        decimals: 0,
-        step: 1,
-        min: 3,
-        onChange: (value) => (rows = value ?? rows),
-      });
-
-      const show = async () => {
-        if (chosen !== null)
-          fill(
-            list,
-            h("li", { class: "path" }, chosen.length === 1 ? chosen[0] : `${chosen.length} files on this computer`),
-          );
-        else {
-          const { images } = await get(projectPath(projectId, "lens/images"));
-          fill(
-            list,
-            images.length === 0
-              ? h(
-                  "li",
-                  { class: "soft" },
-                  "No pictures yet. Fifteen or more, the board at many places of the picture and tilted by 20 to 40°.",
-                )
-              : images.map(thumbnail),
-          );
-        }
-      };
-      const thumbnail = (/** @type {{name: string}} */ { name }) => {
-        const path = projectPath(projectId, `lens/images/${encodeURIComponent(name)}`);
-        const drop = h(
-          "button",
-          { type: "button", "aria-label": `Remove ${name}`, onclick: () => void remove(path).then(show, toastError) },
-          icon("close", "small"),
-        );
-        return h("li", { class: "thumbnail" }, h("img", { src: `/api/${path}`, alt: name, loading: "lazy" }), drop);
-      };
-      const send = async () => {
-        chosen = null;
-        for (const file of await pickFiles({ accept: "image/*", multiple: true }))
-          await sendWithProgress(
-            transfer,
-            projectPath(projectId, "upload/checkerboard", { filename: file.name }),
-            file,
-          );
-        await show();
-      };
-      const choose = async (/** @type {"image" | "video"} */ kind) => {
-        const files = await chooseFiles({
-          title: kind === "image" ? "Choose the checkerboard pictures" : "Choose a video of the board",
-          kind,
-          multiple: kind === "image",
-        });
-        if (files !== null) chosen = files;
-        await show();
-      };
-      start.addEventListener("click", async () => {
+      const start = async () => {
         try {
-          await post(projectPath(projectId, "lens/calibrate"), {
-            files: chosen ?? "uploaded",
-            board: `${columns}x${rows}`,
-            square_m,
-          });
+          await post(projectPath(projectId, "lens/calibrate"), { files: pictures.files, ...board.value() });
           close(true);
         } catch (error) {
           problem.hidden = false;
           problem.textContent = sentence(error);
         }
-      });
-      void show().catch(toastError);
-      const sources = h(
-        "div",
-        { class: "toolbar" },
-        h(
-          "button",
-          { class: "button small", type: "button", onclick: () => void send().catch(toastError) },
-          icon("upload", "small"),
-          "Send pictures…",
-        ),
-        h(
-          "button",
-          { class: "button small", type: "button", onclick: () => void choose("image").catch(toastError) },
-          icon("folder", "small"),
-          "Pictures on this computer…",
-        ),
-        h(
-          "button",
-          { class: "button small", type: "button", onclick: () => void choose("video").catch(toastError) },
-          icon("video", "small"),
-          "Video of the board…",
-        ),
-      );
+      };
       return [
-        h(
-          "div",
-          { class: "dialog-body" },
-          h("div", { class: "field-row" }, across.element, down.element, size.element),
-          sources,
-          transfer,
-          list,
-          problem,
+        h("div", { class: "dialog-body" }, board.element, ...pictures.elements, problem),
+        dialogActions(
+          () => close(null),
+          h("button", { class: "button primary", type: "button", onclick: () => void start() }, "Calibrate"),
         ),
-        dialogActions(() => close(null), start),
       ];
     },
   });
 }
+
+/** What the board is like: its inner corners and the side of a square. */
+function boardFields() {
+  let square_m = /** @type {number | null} */ (0.025);
+  let columns = 9;
+  let rows = 6;
+  const corners = { unit: "", decimals: 0, step: 1, min: 3 };
+  const across = numberField({
+    ...corners,
+    label: "Inner corners, long side",
+    value: columns,
+    onChange: (value) => (columns = value ?? columns),
+  });
+  const down = numberField({
+    ...corners,
+    label: "short side",
+    value: rows,
+    onChange: (value) => (rows = value ?? rows),
+  });
+  const size = numberField({
+    label: "Square",
+    unit: "m",
+    value: square_m,
+    decimals: 4,
+    step: 0.001,
+    min: 0.0001,
+    onChange: (value) => (square_m = value),
+  });
+  return {
+    element: h("div", { class: "field-row" }, across.element, down.element, size.element),
+    value: () => ({ board: `${columns}x${rows}`, square_m }),
+  };
+}
+
+/** The pictures to calibrate from: those sent to the project, or files on this computer. */
+class BoardPictures {
+  /** @type {string[] | null} paths on this computer; null: the pictures sent */
+  #chosen = null;
+  #list = h("ul", { class: "board-images" });
+  #transfer = h("div");
+
+  /** @param {string} projectId */
+  constructor(projectId) {
+    this.projectId = projectId;
+    this.elements = [this.#sources(), this.#transfer, this.#list];
+    void this.#show().catch(toastError);
+  }
+
+  /** As the engine is told. */
+  get files() {
+    return this.#chosen ?? "uploaded";
+  }
+
+  #sources() {
+    return h(
+      "div",
+      { class: "toolbar" },
+      sourceButton("upload", "Send pictures…", () => this.#send()),
+      sourceButton("folder", "Pictures on this computer…", () => this.#choose("image")),
+      sourceButton("video", "Video of the board…", () => this.#choose("video")),
+    );
+  }
+
+  async #send() {
+    this.#chosen = null;
+    for (const file of await pickFiles({ accept: "image/*", multiple: true })) {
+      const path = projectPath(this.projectId, "upload/checkerboard", { filename: file.name });
+      await sendWithProgress(this.#transfer, path, file);
+    }
+    await this.#show();
+  }
+
+  /** @param {"image" | "video"} kind */
+  async #choose(kind) {
+    const files = await chooseFiles({
+      title: kind === "image" ? "Choose the checkerboard pictures" : "Choose a video of the board",
+      kind,
+      multiple: kind === "image",
+    });
+    if (files !== null) this.#chosen = files;
+    await this.#show();
+  }
+
+  async #show() {
+    fill(this.#list, this.#chosen === null ? await this.#thumbnails() : chosenFiles(this.#chosen));
+  }
+
+  async #thumbnails() {
+    const { images } = await get(projectPath(this.projectId, "lens/images"));
+    return images.length === 0 ? noPictures() : images.map(this.#thumbnail, this);
+  }
+
+  /** @param {{name: string}} image */
+  #thumbnail({ name }) {
+    const path = projectPath(this.projectId, `lens/images/${encodeURIComponent(name)}`);
+    const drop = () => void remove(path).then(() => this.#show(), toastError);
+    return h(
+      "li",
+      { class: "thumbnail" },
+      h("img", { src: `/api/${path}`, alt: name, loading: "lazy" }),
+      h("button", { type: "button", "aria-label": `Remove ${name}`, onclick: drop }, icon("close", "small")),
+    );
+  }
+}
+
+/** @param {"upload" | "folder" | "video"} sign @param {string} words @param {() => Promise<void>} run */
+const sourceButton = (sign, words, run) =>
+  h(
+    "button",
+    { class: "button small", type: "button", onclick: () => void run().catch(toastError) },
+    icon(sign, "small"),
+    words,
+  );
+
+/** @param {string[]} files */
+const chosenFiles = (files) =>
+  h("li", { class: "path" }, files.length === 1 ? files[0] : `${files.length} files on this computer`);
+
+const noPictures = () =>
+  h(
+    "li",
+    { class: "soft" },
+    "No pictures yet. Fifteen or more, the board at many places of the picture and tilted by 20 to 40°.",
+  );
 
 /** The report of the last calibration, as a card. @param {string} projectId */
 export function calibrationReport(projectId) {
@@ -197,14 +207,37 @@ export function calibrationReport(projectId) {
 function show(element, projectId, report) {
   const used = report.views.filter((view) => view.used);
   const board = new BoardView(projectId, report.image_size_px);
-  const table = sortableTable({
+  const select = (/** @type {BoardImage} */ view) => {
+    table.select(view.name);
+    board.show(view);
+  };
+  const table = viewsTable(select);
+  table.setRows(report.views);
+  element.hidden = false;
+  fill(
+    element,
+    h("header", {}, h("h2", {}, "Calibration report"), h("span", { class: "badge" }, plural(used.length, "picture"))),
+    figures(report, used.length),
+    ...report.warnings.map((warning) => h("p", { class: "note warn" }, icon("warn"), h("span", {}, warning))),
+    h(
+      "div",
+      { class: "report-columns" },
+      h("div", { class: "report-table" }, table.element),
+      board.element,
+      parameters(report),
+    ),
+  );
+  const first = used[0] ?? report.views[0];
+  if (first !== undefined) select(first);
+}
+
+/** @param {(view: BoardImage) => void} onSelect */
+function viewsTable(onSelect) {
+  return new SortableTable({
     label: "Pictures of the board",
     id: (/** @type {BoardImage} */ view) => view.name,
     rowClass: (view) => (view.used ? "" : "off"),
-    onSelect: (view) => {
-      table.select(view.name);
-      board.show(view);
-    },
+    onSelect,
     columns: [
       { key: "name", title: "Picture", cell: (view) => view.name, sort: (view) => view.name },
       {
@@ -222,8 +255,28 @@ function show(element, projectId, report) {
       },
     ],
   });
-  table.setRows(report.views);
-  const parameters = h(
+}
+
+/** @param {Report} report @param {number} used */
+function figures(report, used) {
+  const entries = [
+    [pixels(report.rms_px, 3), "RMS"],
+    [`${used} of ${report.views.length}`, "pictures used"],
+    [`${fixed(100 * report.covered_share, 0)} %`, "of the picture covered"],
+    [`${report.board.join(" × ")}, ${fixed(report.square_m * 1000, 1)} mm`, "board"],
+  ];
+  return h(
+    "div",
+    { class: "figures" },
+    entries.map(([value, name]) =>
+      h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name)),
+    ),
+  );
+}
+
+/** @param {Report} report */
+function parameters(report) {
+  return h(
     "dl",
     { class: "facts" },
     report.parameters.flatMap(({ name, value, deviation }) => {
@@ -231,36 +284,4 @@ function show(element, projectId, report) {
       return [h("dt", {}, name), h("dd", {}, `${fixed(value, decimals)} ± ${fixed(deviation, decimals)}`)];
     }),
   );
-  const figures = h(
-    "div",
-    { class: "figures" },
-    [
-      [pixels(report.rms_px, 3), "RMS"],
-      [`${used.length} of ${report.views.length}`, "pictures used"],
-      [`${fixed(100 * report.covered_share, 0)} %`, "of the picture covered"],
-      [`${report.board.join(" × ")}, ${fixed(report.square_m * 1000, 1)} mm`, "board"],
-    ].map(([value, name]) => h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name))),
-  );
-  const warnings = report.warnings.map((warning) =>
-    h("p", { class: "note warn" }, icon("warn"), h("span", {}, warning)),
-  );
-  element.hidden = false;
-  fill(
-    element,
-    h("header", {}, h("h2", {}, "Calibration report"), h("span", { class: "badge" }, plural(used.length, "picture"))),
-    figures,
-    ...warnings,
-    h(
-      "div",
-      { class: "report-columns" },
-      h("div", { class: "report-table" }, table.element),
-      board.element,
-      parameters,
-    ),
-  );
-  const first = used[0] ?? report.views[0];
-  if (first !== undefined) {
-    table.select(first.name);
-    board.show(first);
-  }
 }

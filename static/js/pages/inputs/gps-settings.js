@@ -10,47 +10,35 @@ const COLUMNS = /** @type {const} */ ([
   ["y", "North, m"],
 ]);
 
+const ANTENNA = /** @type {const} */ ([
+  ["Antenna east", 0],
+  ["Antenna north", 1],
+]);
+
+/** @typedef {import("../../lib/types.js").GpsInput} GpsInput */
+
 /** @param {import("../../lib/store.js").ProjectStore} store */
 export async function gpsSettings(store) {
   const now = store.project.inputs.gps;
   if (now === null) return;
   const wanted = structuredClone(now);
   const at = /** @type {[number | null, number | null]} */ ([...(now.at_m ?? [null, null])]);
-  const accepted = await openDialog({
+  if ((await ask(wanted, at)) === null) return;
+  const [east, north] = at;
+  await store.edit(
+    "GPS columns",
+    (draft) => void (draft.inputs.gps = { ...wanted, at_m: east === null || north === null ? null : [east, north] }),
+  );
+}
+
+/** Write what a person types into `wanted` and `at`; null when it is not to be used. @param {GpsInput} wanted @param {[number | null, number | null]} at */
+function ask(wanted, at) {
+  return openDialog({
     title: "GPS columns and antenna",
     body: (close) => {
-      const inputs = COLUMNS.map(([key, label]) => {
-        const input = h("input", {
-          class: "input",
-          id: `gps-${key}`,
-          type: "text",
-          required: true,
-          value: now[key],
-          spellcheck: "false",
-          oninput: () => void (wanted[key] = input.value.trim()),
-        });
-        return h("div", { class: "field" }, h("label", { class: "label", for: `gps-${key}` }, label), input);
-      });
-      const antenna = /** @type {const} */ ([
-        ["Antenna east", 0],
-        ["Antenna north", 1],
-      ]).map(
-        ([label, axis]) =>
-          numberField({
-            label,
-            unit: "m",
-            value: at[axis],
-            decimals: 3,
-            optional: true,
-            onChange: (value) => (at[axis] = value),
-          }).element,
-      );
       const submit = (/** @type {Event} */ event) => (event.preventDefault(), close(true));
-      const hint = h(
-        "p",
-        { class: "small faint" },
-        "The antenna's place on the roof lets the building's rotation be taken into account. Leave it empty for the middle of P1 and P2.",
-      );
+      const hint =
+        "The antenna's place on the roof lets the building's rotation be taken into account. Leave it empty for the middle of P1 and P2.";
       return [
         h(
           "form",
@@ -58,19 +46,42 @@ export async function gpsSettings(store) {
           h(
             "div",
             { class: "dialog-body" },
-            h("div", { class: "field-row" }, inputs),
-            h("div", { class: "field-row" }, antenna),
-            hint,
+            h("div", { class: "field-row" }, columnFields(wanted)),
+            h("div", { class: "field-row" }, antennaFields(at)),
+            h("p", { class: "small faint" }, hint),
           ),
           dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, "Save")),
         ),
       ];
     },
   });
-  if (accepted === null) return;
-  const [east, north] = at;
-  await store.edit(
-    "GPS columns",
-    (draft) => void (draft.inputs.gps = { ...wanted, at_m: east === null || north === null ? null : [east, north] }),
-  );
 }
+
+/** @param {GpsInput} wanted */
+const columnFields = (wanted) =>
+  COLUMNS.map(([key, label]) => {
+    const input = h("input", {
+      class: "input",
+      id: `gps-${key}`,
+      type: "text",
+      required: true,
+      value: wanted[key],
+      spellcheck: "false",
+      oninput: () => void (wanted[key] = input.value.trim()),
+    });
+    return h("div", { class: "field" }, h("label", { class: "label", for: input.id }, label), input);
+  });
+
+/** @param {[number | null, number | null]} at */
+const antennaFields = (at) =>
+  ANTENNA.map(([label, axis]) => {
+    const field = numberField({
+      label,
+      unit: "m",
+      value: at[axis],
+      decimals: 3,
+      optional: true,
+      onChange: (value) => (at[axis] = value),
+    });
+    return field.element;
+  });

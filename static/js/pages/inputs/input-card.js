@@ -11,94 +11,114 @@ import { factList } from "./facts.js";
 
 /** @typedef {"video" | "cloud" | "lens" | "gps"} InputKind */
 
+/** @typedef {"none" | "wrong" | "reading" | "read"} InputState */
+
+const STATES = /** @type {Record<InputState, {words: string, tone: string}>} */ ({
+  none: { words: "not given", tone: "" },
+  wrong: { words: "cannot be used", tone: "bad" },
+  reading: { words: "being read…", tone: "accent" },
+  read: { words: "understood", tone: "good" },
+});
+
 /**
- * @param {object} options
- * @param {string} options.projectId
- * @param {InputKind} options.kind
- * @param {string} options.title
- * @param {string} options.why  said while it is missing
- * @param {string} options.accept
- * @param {import("../../lib/icons.js").IconName} options.glyph
- * @param {(path: string) => Promise<void>} options.onPath
- * @param {() => void} options.onChange
- * @param {(() => Promise<void>) | null} options.onRemove  null where it is required
- * @param {Node[]} [options.more]  further actions
+ * @typedef {object} InputCardOptions
+ * @property {string} projectId
+ * @property {InputKind} kind
+ * @property {string} title
+ * @property {string} why  said while it is missing
+ * @property {string} accept
+ * @property {import("../../lib/icons.js").IconName} glyph
+ * @property {(path: string) => Promise<void>} onPath
+ * @property {() => void} onChange
+ * @property {(() => Promise<void>) | null} onRemove  null where it is required
+ * @property {Node[]} [more]  further actions
  */
-export function inputCard({ projectId, kind, title, why, accept, glyph, onPath, onChange, onRemove, more = [] }) {
+
+/** @param {InputCardOptions} options */
+export function inputCard(options) {
+  const { kind, title, glyph, accept, onRemove, more = [] } = options;
   const badge = h("span", { class: "badge" });
   const body = h("div", { class: "input-body" });
   const transfer = h("div");
-  const browse = h(
-    "button",
-    { class: "button small", type: "button" },
-    icon("folder", "small"),
-    "Choose on this computer…",
-  );
-  const send = h("button", { class: "button small", type: "button" }, icon("upload", "small"), "Upload…");
-  const drop = h("button", { class: "button quiet small", type: "button", hidden: true }, "Remove");
+  const send = (/** @type {File | undefined} */ file) => file && void sendInput(file, transfer, options);
+  const upload = async () => send((await pickFiles({ accept }))[0]);
+  const remove = () => void onRemove?.().catch(toastError);
+  const drop = h("button", { class: "button quiet small", type: "button", hidden: true, onclick: remove }, "Remove");
   const element = h(
     "section",
     { class: "card input-card", "data-kind": kind, "aria-label": title },
     h("header", {}, icon(glyph), h("h2", {}, title), badge),
     body,
     transfer,
-    h("div", { class: "toolbar" }, browse, send, more, h("span", { class: "spring" }), drop),
+    h(
+      "div",
+      { class: "toolbar" },
+      actionButton("folder", "Choose on this computer…", () => void chooseInput(options)),
+      actionButton("upload", "Upload…", () => void upload()),
+      more,
+      h("span", { class: "spring" }),
+      drop,
+    ),
   );
-
-  browse.addEventListener("click", async () => {
-    const files = await chooseFiles({ title: `Choose the ${title.toLowerCase()}`, kind });
-    if (files !== null) await onPath(files[0]).catch(toastError);
-  });
-  send.addEventListener("click", async () => {
-    const [file] = await pickFiles({ accept });
-    if (file !== undefined) await sendFile(file);
-  });
-  drop.addEventListener("click", () => void onRemove?.().catch(toastError));
-  acceptDrops(element, (files) => void sendFile(files[0]));
-
-  const sendFile = async (/** @type {File} */ file) => {
-    try {
-      await sendWithProgress(transfer, projectPath(projectId, `upload/${kind}`, { filename: file.name }), file);
-      toast(`${file.name} is here.`, { tone: "good" });
-      onChange();
-    } catch (error) {
-      toastError(error);
-    }
-  };
+  acceptDrops(element, ([file]) => send(file));
   return {
     element,
     /** @param {Record<string, any> | null} facts */
     show(facts) {
-      const state = facts === null ? "none" : facts.error ? "wrong" : facts.reading ? "reading" : "read";
+      const state = stateOf(facts);
       element.dataset.state = state;
-      badge.className = `badge ${{ none: "", wrong: "bad", reading: "accent", read: "good" }[state]}`;
-      badge.textContent = { none: "not given", wrong: "cannot be used", reading: "being read…", read: "understood" }[
-        state
-      ];
+      badge.className = `badge ${STATES[state].tone}`;
+      badge.textContent = STATES[state].words;
       drop.hidden = facts === null || onRemove === null;
-      if (facts === null) fill(body, h("p", { class: "soft" }, why));
-      else if (facts.error)
-        fill(
-          body,
-          h("p", { class: "path" }, facts.file),
-          h("p", { class: "note bad" }, icon("warn"), h("span", {}, facts.error.message)),
-        );
-      else if (facts.reading)
-        fill(body, h("p", { class: "path" }, facts.file), h("progress", { "aria-label": "Reading" }));
-      else
-        fill(
-          body,
-          factList(kind, facts),
-          kind === "video" &&
-            h("img", {
-              class: "still",
-              alt: "First frame",
-              src: `/api/${projectPath(projectId, "frames/0.jpg", { w: 480, v: facts.file })}`,
-            }),
-        );
+      fill(body, understood(options, facts));
     },
   };
 }
+
+/** @param {import("../../lib/icons.js").IconName} glyph @param {string} words @param {() => void} onclick */
+const actionButton = (glyph, words, onclick) =>
+  h("button", { class: "button small", type: "button", onclick }, icon(glyph, "small"), words);
+
+/** By its place on this computer. @param {InputCardOptions} options */
+async function chooseInput({ kind, title, onPath }) {
+  const files = await chooseFiles({ title: `Choose the ${title.toLowerCase()}`, kind });
+  if (files !== null) await onPath(files[0]).catch(toastError);
+}
+
+/** @param {File} file @param {HTMLElement} transfer shows how far it is @param {InputCardOptions} options */
+async function sendInput(file, transfer, { projectId, kind, onChange }) {
+  try {
+    await sendWithProgress(transfer, projectPath(projectId, `upload/${kind}`, { filename: file.name }), file);
+    toast(`${file.name} is here.`, { tone: "good" });
+    onChange();
+  } catch (error) {
+    toastError(error);
+  }
+}
+
+/** @param {Record<string, any> | null} facts @returns {InputState} */
+function stateOf(facts) {
+  if (facts === null) return "none";
+  if (facts.error) return "wrong";
+  return facts.reading ? "reading" : "read";
+}
+
+/** @param {InputCardOptions} options @param {Record<string, any> | null} facts @returns {import("../../lib/dom.js").Child[]} */
+function understood({ projectId, kind, why }, facts) {
+  if (facts === null) return [h("p", { class: "soft" }, why)];
+  const path = h("p", { class: "path" }, facts.file);
+  if (facts.error) return [path, h("p", { class: "note bad" }, icon("warn"), h("span", {}, facts.error.message))];
+  if (facts.reading) return [path, h("progress", { "aria-label": "Reading" })];
+  return [factList(kind, facts), kind === "video" && still(projectId, facts.file)];
+}
+
+/** @param {string} projectId @param {string} file changes the address with the video */
+const still = (projectId, file) =>
+  h("img", {
+    class: "still",
+    alt: "First frame",
+    src: `/api/${projectPath(projectId, "frames/0.jpg", { w: 480, v: file })}`,
+  });
 
 /** Stream a file, showing how far it is, with a way to stop. @param {HTMLElement} place @param {string} path @param {File} file */
 export async function sendWithProgress(place, path, file) {

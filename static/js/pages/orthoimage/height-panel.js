@@ -40,38 +40,15 @@ export function heightPanel(element, targets, onTaken) {
     targets.change(name, `Height of ${name}`, (entry) => void (entry.height_m = height_m));
     onTaken(name);
   });
-  const showTargets = () => {
-    const chosen = target.value;
-    fill(
-      target,
-      targets.all.map(({ name, height_m }) =>
-        h("option", { value: name }, height_m === null ? name : `${name} (now ${metres(height_m)})`),
-      ),
-      h("option", { value: NEW }, "a new target"),
-    );
-    target.value = targets.all.some(({ name }) => name === chosen) ? chosen : (targets.all[0]?.name ?? NEW);
-  };
-  targets.on("change", showTargets);
-  showTargets();
+  const offer = () => offerTargets(target, targets.all);
+  targets.on("change", offer);
+  offer();
   return {
     /** @param {Height} height */
     show(height) {
       seen = height;
       row.hidden = false;
-      const [x, y] = height.place_m;
-      const figures = h(
-        "div",
-        { class: "figures" },
-        figure(metres(height.height_m), "above the ground"),
-        figure(`± ${millimetres(height.spread_m, 0)}`, `spread of ${plural(height.points, "point")}`),
-      );
-      fill(
-        box,
-        figures,
-        h("p", { class: "small faint number" }, `at ${fixed(x, 2)}, ${fixed(y, 2)} m`),
-        height.spread_m > UNEVEN_M &&
-          note("warn", "The cloud is uneven here: an edge, or several surfaces. Click the middle of a flat part."),
-      );
+      fill(box, reading(height));
     },
     /** @param {string} message */
     refuse(message) {
@@ -80,6 +57,34 @@ export function heightPanel(element, targets, onTaken) {
       fill(box, note("warn", message));
     },
   };
+}
+
+/** Refresh the choice of targets, keeping what is chosen. @param {HTMLSelectElement} select @param {Targets["all"]} all */
+function offerTargets(select, all) {
+  const chosen = select.value;
+  fill(
+    select,
+    all.map(({ name, height_m }) =>
+      h("option", { value: name }, height_m === null ? name : `${name} (now ${metres(height_m)})`),
+    ),
+    h("option", { value: NEW }, "a new target"),
+  );
+  select.value = all.some(({ name }) => name === chosen) ? chosen : (all[0]?.name ?? NEW);
+}
+
+/** @param {Height} height */
+function reading({ place_m: [x, y], height_m, spread_m, points }) {
+  return [
+    h(
+      "div",
+      { class: "figures" },
+      figure(metres(height_m), "above the ground"),
+      figure(`± ${millimetres(spread_m, 0)}`, `spread of ${plural(points, "point")}`),
+    ),
+    h("p", { class: "small faint number" }, `at ${fixed(x, 2)}, ${fixed(y, 2)} m`),
+    spread_m > UNEVEN_M &&
+      note("warn", "The cloud is uneven here: an edge, or several surfaces. Click the middle of a flat part."),
+  ];
 }
 
 /** @param {string} value @param {string} name */

@@ -18,47 +18,14 @@ export function newProjectDialog() {
   return openDialog({
     title: "New project",
     body: (close) => {
-      const name = h("input", {
-        class: "input",
-        id: "project-name",
-        type: "text",
-        required: true,
-        placeholder: "EQ7",
-        autocomplete: "off",
-        spellcheck: "false",
-        autofocus: true,
-      });
+      const name = nameInput();
       const problem = h("p", { class: "note bad", role: "alert", hidden: true });
       /** @type {Record<string, string>} */
       const chosen = {};
-      const rows = INPUTS.map(({ kind, name: title, hint }) => {
-        const path = h("span", { class: "path soft" }, hint);
-        const choose = async () => {
-          const files = await chooseFiles({ title: `Choose the ${title.toLowerCase()}`, kind });
-          if (files === null) return;
-          chosen[kind] = files[0];
-          path.textContent = files[0];
-          path.className = "path";
-          if (name.value === "" && kind === "video")
-            name.value =
-              files[0]
-                .split("/")
-                .at(-1)
-                ?.replace(/\.[^.]+$/, "") ?? "";
-        };
-        return h(
-          "div",
-          { class: "source-row", "data-kind": kind },
-          h("span", { class: "label" }, title),
-          path,
-          h(
-            "button",
-            { class: "button small", type: "button", onclick: () => void choose() },
-            icon("folder", "small"),
-            "Browse…",
-          ),
-        );
-      });
+      const onChosen = (/** @type {string} */ kind, /** @type {string} */ path) => {
+        chosen[kind] = path;
+        if (name.value === "" && kind === "video") name.value = stem(path);
+      };
       const submit = async (/** @type {Event} */ event) => {
         event.preventDefault();
         try {
@@ -68,25 +35,71 @@ export function newProjectDialog() {
           problem.textContent = sentence(error);
         }
       };
-      const field = h("div", { class: "field" }, h("label", { class: "label", for: "project-name" }, "Name"), name);
-      const files = h(
-        "div",
-        { class: "source-rows" },
-        rows,
-        h(
-          "p",
-          { class: "small faint" },
-          "Files stay where they are. All of them can be chosen, sent or changed later, in step 1.",
-        ),
-      );
+      const field = h("div", { class: "field" }, h("label", { class: "label", for: name.id }, "Name"), name);
       return [
         h(
           "form",
           { class: "dialog-form", onsubmit: submit },
-          h("div", { class: "dialog-body" }, field, files, problem),
+          h("div", { class: "dialog-body" }, field, sourceRows(onChosen), problem),
           dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, "Create")),
         ),
       ];
     },
   });
 }
+
+const nameInput = () =>
+  h("input", {
+    class: "input",
+    id: "project-name",
+    type: "text",
+    required: true,
+    placeholder: "EQ7",
+    autocomplete: "off",
+    spellcheck: "false",
+    autofocus: true,
+  });
+
+/** @param {(kind: string, path: string) => void} onChosen */
+const sourceRows = (onChosen) =>
+  h(
+    "div",
+    { class: "source-rows" },
+    INPUTS.map((input) => sourceRow(input, onChosen)),
+    h(
+      "p",
+      { class: "small faint" },
+      "Files stay where they are. All of them can be chosen, sent or changed later, in step 1.",
+    ),
+  );
+
+/** @param {typeof INPUTS[number]} input @param {(kind: string, path: string) => void} onChosen */
+function sourceRow({ kind, name, hint }, onChosen) {
+  const path = h("span", { class: "path soft" }, hint);
+  const choose = async () => {
+    const files = await chooseFiles({ title: `Choose the ${name.toLowerCase()}`, kind });
+    if (files === null) return;
+    path.textContent = files[0];
+    path.className = "path";
+    onChosen(kind, files[0]);
+  };
+  return h(
+    "div",
+    { class: "source-row", "data-kind": kind },
+    h("span", { class: "label" }, name),
+    path,
+    h(
+      "button",
+      { class: "button small", type: "button", onclick: () => void choose() },
+      icon("folder", "small"),
+      "Browse…",
+    ),
+  );
+}
+
+/** A file's name without folder and ending. @param {string} path */
+const stem = (path) =>
+  path
+    .split("/")
+    .at(-1)
+    ?.replace(/\.[^.]+$/, "") ?? "";

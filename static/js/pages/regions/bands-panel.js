@@ -11,11 +11,40 @@ import { LINE_NAMES, lengthOf, rounded } from "./band.js";
 /** @typedef {import("./band-editor.js").BandEditor} BandEditor */
 /** @typedef {import("./preview.js").Preview} Preview */
 
+/** @typedef {import("./preview.js").LinePreview} LinePreview */
+/** @typedef {{label: string, min?: number, read: (band: Band) => number, write: (band: Band, value: number) => Band}} BandNumber */
+
 const WORDS = { L1: "first line of the pair", L2: "second line of the pair", T1: "line across them" };
+const NEXT_CLICK = ["click one end of it", "click its other end", "click at half its width"];
+
+/** @type {BandNumber[]} in the order shown */
+const NUMBERS = [
+  {
+    label: "from east",
+    read: (band) => band.from_m[0],
+    write: (band, value) => ({ ...band, from_m: [value, band.from_m[1]] }),
+  },
+  {
+    label: "from north",
+    read: (band) => band.from_m[1],
+    write: (band, value) => ({ ...band, from_m: [band.from_m[0], value] }),
+  },
+  { label: "width", min: 0.05, read: (band) => band.width_m, write: (band, value) => ({ ...band, width_m: value }) },
+  {
+    label: "to east",
+    read: (band) => band.to_m[0],
+    write: (band, value) => ({ ...band, to_m: [value, band.to_m[1]] }),
+  },
+  {
+    label: "to north",
+    read: (band) => band.to_m[1],
+    write: (band, value) => ({ ...band, to_m: [band.to_m[0], value] }),
+  },
+];
 
 /** @param {HTMLElement} element @param {BandEditor} editor @param {(line: LineName, band: Band) => void} save */
 export function bandsPanel(element, editor, save) {
-  const rows = new Map(LINE_NAMES.map((line) => [line, bandRow(line, editor, save)]));
+  const rows = new Map(LINE_NAMES.map((line) => [line, new BandRow(line, editor, save)]));
   const message = h("p", { class: "note", role: "status", hidden: true });
   fill(
     element,
@@ -33,10 +62,67 @@ export function bandsPanel(element, editor, save) {
   };
 }
 
-/** @param {LineName} line @param {BandEditor} editor @param {(line: LineName, band: Band) => void} save */
-function bandRow(line, editor, save) {
-  const found = h("span", { class: "found small number" });
-  const redraw = h(
+/** One band: its name, what is found in it or what to click next, and its numbers while it is selected. */
+class BandRow {
+  #found = h("span", { class: "found small number" });
+  #length = h("p", { class: "small faint number" });
+
+  /** @param {LineName} line @param {BandEditor} editor @param {(line: LineName, band: Band) => void} save */
+  constructor(line, editor, save) {
+    this.line = line;
+    this.editor = editor;
+    this.fields = NUMBERS.map((number) => bandField(number, line, editor, save));
+    this.redraw = redrawButton(line, editor);
+    this.numbers = h(
+      "div",
+      { class: "band-fields" },
+      this.fields.map((field) => field.element),
+      this.#length,
+    );
+    this.element = h(
+      "div",
+      { class: "band-row", "data-line": line },
+      h("div", { class: "band-title" }, this.#head(), this.redraw),
+      this.numbers,
+    );
+  }
+
+  #head() {
+    return h(
+      "button",
+      { class: "band-head", type: "button", onclick: () => this.editor.select(this.line) },
+      h("span", { class: `swatch ${this.line.toLowerCase()}` }),
+      h("strong", {}, this.line),
+      this.#found,
+    );
+  }
+
+  /** @param {Band | null} band @param {LinePreview | null} preview */
+  show(band, preview) {
+    const { editor, line } = this;
+    const isSelected = editor.selected?.line === line;
+    this.element.classList.toggle("selected", isSelected || editor.nextLine === line);
+    this.numbers.hidden = band === null || !isSelected;
+    this.redraw.hidden = band === null;
+    this.#found.className = `found small number ${preview !== null && preview.points === 0 ? "bad" : "soft"}`;
+    this.#found.textContent = this.#words(band, preview);
+    if (band === null) return;
+    NUMBERS.forEach(({ read }, i) => this.fields[i].set(read(band)));
+    this.#length.textContent = `${metres(lengthOf(band), 2)} long`;
+  }
+
+  /** @param {Band | null} band @param {LinePreview | null} preview */
+  #words(band, preview) {
+    if (this.editor.nextLine === this.line) return NEXT_CLICK[this.editor.draft.length];
+    if (band === null) return WORDS[this.line];
+    if (preview === null) return metres(lengthOf(band));
+    return preview.message || `${count(preview.points)} points, ${pixels(preview.rms_px)}`;
+  }
+}
+
+/** @param {LineName} line @param {BandEditor} editor */
+const redrawButton = (line, editor) =>
+  h(
     "button",
     {
       class: "button small",
@@ -46,97 +132,19 @@ function bandRow(line, editor, save) {
     },
     "Redraw",
   );
-  const head = h(
-    "button",
-    { class: "band-head", type: "button", onclick: () => editor.select(line) },
-    h("span", { class: `swatch ${line.toLowerCase()}` }),
-    h("strong", {}, line),
-    found,
-  );
-  const field = (
-    /** @type {string} */ label,
-    /** @type {(band: Band) => number} */ read,
-    /** @type {(band: Band, value: number) => Band} */ write,
-    min = -Infinity,
-  ) => ({
-    read,
-    field: numberField({
-      label,
-      unit: "m",
-      value: null,
-      decimals: 3,
-      step: 0.01,
-      min,
-      compact: true,
-      onChange(value) {
-        const band = editor.bands[line];
-        if (band !== undefined && value !== null) save(line, rounded(write(band, value)));
-      },
-    }),
-  });
-  const fields = [
-    field(
-      "from east",
-      (band) => band.from_m[0],
-      (band, value) => ({ ...band, from_m: [value, band.from_m[1]] }),
-    ),
-    field(
-      "from north",
-      (band) => band.from_m[1],
-      (band, value) => ({ ...band, from_m: [band.from_m[0], value] }),
-    ),
-    field(
-      "width",
-      (band) => band.width_m,
-      (band, value) => ({ ...band, width_m: value }),
-      0.05,
-    ),
-    field(
-      "to east",
-      (band) => band.to_m[0],
-      (band, value) => ({ ...band, to_m: [value, band.to_m[1]] }),
-    ),
-    field(
-      "to north",
-      (band) => band.to_m[1],
-      (band, value) => ({ ...band, to_m: [band.to_m[0], value] }),
-    ),
-  ];
-  const length = h("p", { class: "small faint number" });
-  const numbers = h(
-    "div",
-    { class: "band-fields" },
-    fields.map((entry) => entry.field.element),
-    length,
-  );
-  const element = h(
-    "div",
-    { class: "band-row", "data-line": line },
-    h("div", { class: "band-title" }, head, redraw),
-    numbers,
-  );
-  return {
-    element,
-    /** @param {Band | null} band @param {{points: number, rms_px: number | null, message: string | null} | null} line_found */
-    show(band, line_found) {
-      const isNext = editor.nextLine === line;
-      element.classList.toggle("selected", editor.selected?.line === line || isNext);
-      numbers.hidden = band === null || editor.selected?.line !== line;
-      redraw.hidden = band === null;
-      found.className = `found small number ${line_found !== null && line_found.points === 0 ? "bad" : "soft"}`;
-      if (isNext)
-        found.textContent = ["click one end of it", "click its other end", "click at half its width"][
-          editor.draft.length
-        ];
-      else if (band === null) found.textContent = WORDS[line];
-      else
-        found.textContent =
-          line_found === null
-            ? metres(lengthOf(band))
-            : line_found.message || `${count(line_found.points)} points, ${pixels(line_found.rms_px)}`;
-      if (band === null) return;
-      for (const { read, field: input } of fields) input.set(read(band));
-      length.textContent = `${metres(lengthOf(band), 2)} long`;
+
+/** @param {BandNumber} number @param {LineName} line @param {BandEditor} editor @param {(line: LineName, band: Band) => void} save */
+const bandField = ({ label, min, write }, line, editor, save) =>
+  numberField({
+    label,
+    unit: "m",
+    value: null,
+    decimals: 3,
+    step: 0.01,
+    min,
+    compact: true,
+    onChange(value) {
+      const band = editor.bands[line];
+      if (band !== undefined && value !== null) save(line, rounded(write(band, value)));
     },
-  };
-}
+  });

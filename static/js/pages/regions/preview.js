@@ -1,5 +1,7 @@
 // What the engine finds in the bands of a target right now, and how it is drawn over both pictures.
 
+import { markColour } from "../../components/palette.js";
+
 /** @typedef {import("../../lib/types.js").Point} Point */
 /** @typedef {import("../../lib/types.js").LineName} LineName */
 /** @typedef {import("../../components/shapes.js").Shape} Shape */
@@ -21,7 +23,6 @@
  * @typedef {"plan" | "raw"} Frame
  */
 
-const COLOURS = { L1: "#56b4e9", L2: "#f5a318", T1: "#e58fc0" }; // as --l1, --l2, --t1 in css/tokens.css
 /** Lines and intersections as shapes. @param {Preview | null} preview @param {Frame} frame @param {(point: Point) => Point} toPixels @returns {Shape[]} */
 export function previewShapes(preview, frame, toPixels) {
   /** @type {Shape[]} */
@@ -58,8 +59,6 @@ export function previewShapes(preview, frame, toPixels) {
   return shapes;
 }
 
-const PATCHES = "#fff04a";
-
 /** Hundreds of edge points, on the canvas. @param {() => Preview | null} current @param {Frame} frame @param {(point: Point) => Point} toPixels @returns {import("../../components/pane.js").Painter} */
 export function edgePainter(current, frame, toPixels) {
   return (context, view) => {
@@ -72,8 +71,8 @@ export function edgePainter(current, frame, toPixels) {
         Math.min(2.4, Math.max(1, view.scale * 0.6)),
       );
     for (const [line, found] of lines(preview))
-      dots((frame === "plan" ? found.edges_plan : found.edges_raw).flat(), COLOURS[line]);
-    dots((frame === "plan" ? preview?.points_plan : preview?.points_raw) ?? [], PATCHES);
+      dots((frame === "plan" ? found.edges_plan : found.edges_raw).flat(), markColour(`--${line.toLowerCase()}`));
+    dots((frame === "plan" ? preview?.points_plan : preview?.points_raw) ?? [], markColour("--corner-point"));
   };
 }
 

@@ -23,9 +23,19 @@ export function targetsPanel(element, targets) {
     ],
   });
   const list = h("ul", { class: "target-list", role: "listbox", "aria-label": "Targets" });
-  const settings = h("div", { class: "settings" });
-  fill(element, h("header", {}, h("h2", {}, "Targets"), add), list, settings);
+  const settings = targetSettings(targets);
+  fill(element, h("header", {}, h("h2", {}, "Targets"), add), list, settings.element);
 
+  return function show() {
+    const { all, selected } = targets;
+    const rows = all.map((target) => row(targets, target, target.name === selected?.name));
+    fill(list, rows.length === 0 ? noTargets() : rows);
+    settings.show();
+  };
+}
+
+/** Height, P1–P2 distance and reference of the chosen target. @param {Targets} targets */
+function targetSettings(targets) {
   const change = (/** @type {string} */ what, /** @type {(target: OpenTarget) => void} */ edit) => {
     const { selected } = targets;
     if (selected !== null) targets.change(selected.name, `${what} of ${selected.name}`, edit);
@@ -48,47 +58,44 @@ export function targetsPanel(element, targets) {
     optional: true,
     onChange: (value) => change("P1–P2 distance", (target) => void (target.p1_p2_m = value)),
   });
-  const relative = h("select", { class: "input", id: "relative-to" });
-  relative.addEventListener("change", () =>
-    change("Reference", (target) => void (target.relative_to = relative.value || null)),
-  );
-  fill(
-    settings,
+  const relative = h("select", {
+    class: "input",
+    id: "relative-to",
+    onchange: () => change("Reference", (target) => void (target.relative_to = relative.value || null)),
+  });
+  const element = h(
+    "div",
+    { class: "settings" },
     h("div", { class: "field-row" }, height.element, apart.element),
     h(
       "div",
       { class: "field" },
-      h("label", { class: "label", for: "relative-to" }, "Displacement relative to"),
+      h("label", { class: "label", for: relative.id }, "Displacement relative to"),
       relative,
     ),
   );
-
-  return function show() {
-    const { all, selected } = targets;
-    fill(
-      list,
-      all.map((target) => row(targets, target, target.name === selected?.name)),
-    );
-    if (all.length === 0)
-      fill(
-        list,
-        h("li", { class: "none" }, "Nothing to measure yet. Add the roof, and the shake table if it is in view."),
-      );
-    settings.hidden = selected === null;
-    if (selected === null) return;
-    height.set(selected.height_m);
-    apart.set(selected.p1_p2_m);
-    const bases = all.filter(
-      (target) => target.name !== selected.name && target.relative_to === null && isComplete(target),
-    );
-    fill(
-      relative,
-      h("option", { value: "" }, "its own rest position"),
-      bases.map((target) => h("option", { value: target.name }, target.name)),
-    );
-    relative.value = selected.relative_to ?? "";
+  return {
+    element,
+    show() {
+      const { all, selected } = targets;
+      element.hidden = selected === null;
+      if (selected === null) return;
+      height.set(selected.height_m);
+      apart.set(selected.p1_p2_m);
+      fill(relative, h("option", { value: "" }, "its own rest position"), bases(all, selected));
+      relative.value = selected.relative_to ?? "";
+    },
   };
 }
+
+const noTargets = () =>
+  h("li", { class: "none" }, "Nothing to measure yet. Add the roof, and the shake table if it is in view.");
+
+/** What a target can be relative to: never itself, nor what is relative to something else. @param {OpenTarget[]} all @param {OpenTarget} selected */
+const bases = (all, selected) =>
+  all
+    .filter((target) => target.name !== selected.name && target.relative_to === null && isComplete(target))
+    .map((target) => h("option", { value: target.name }, target.name));
 
 /** @param {Targets} targets @param {OpenTarget} target @param {boolean} isSelected */
 function row(targets, target, isSelected) {
