@@ -31,6 +31,8 @@ from core.solution import Ground
 # Moments at which corrections are tried, and the fewest that say anything.
 MOMENTS = 48
 LEAST_MOMENTS = 12
+# How well people know the distance P1-P2: as a tape tells it, metres.
+DISTANCE_SIGMA_M = 1e-3
 # Drift below which stationary frames say nothing about the calibration, metres.
 LEAST_DRIFT_M = 0.02
 # Uncertainty of a roof's height above the ground, one standard deviation: LiDAR, and where exactly the strip lies.
@@ -177,7 +179,12 @@ def calibrate(evidence: Evidence) -> SelfCalibration:
     sigma[~(np.isfinite(at_start) & np.isin(part, calm)[:, None])] = np.nan
     if not np.isfinite(sigma).any():
         return refused(parameters, "no target was measured while the building stands still")
-    return self_calibrate(parameters, motion, sigma, ground_misfit(evidence), part=part)
+    ground, distances = ground_misfit(evidence), distance_misfit(evidence)
+
+    def misfit(correction: Floats) -> Floats:
+        return np.concatenate([ground(correction), distances(correction)])
+
+    return self_calibrate(parameters, motion, sigma, misfit, part=part)
 
 
 def _stationary_groups(parts: Sequence[Bools], usable: Bools) -> tuple[list[NDArray[np.int64]], NDArray[np.int64]]:
@@ -291,6 +298,22 @@ def ground_misfit(evidence: Evidence) -> Callable[[Floats], Floats]:
     first = left_over(np.zeros(len(evidence.parameters)))
     noise = ALIKE * 1.4826 * float(np.median(np.abs(first[agree]))) if agree.any() else 1.0
     return lambda correction: left_over(correction).ravel() / max(noise, 1e-9)
+
+
+def distance_misfit(evidence: Evidence) -> Callable[[Floats], Floats]:
+    """Return a function from corrections (P,) to what known distances P1-P2 are missed by, over their uncertainty."""
+    known = [target for target in evidence.project.targets if target.kind == "lines" and target.p1_p2_m is not None]
+
+    def missed_by(correction: Floats) -> Floats:
+        used = evidence.corrected(correction)
+        bodies = [
+            rest_body(evidence.recording, target.name, used.lens, used.pose0, used.heights_m[target.name])
+            for target in known
+        ]
+        measured_m = np.array([np.linalg.norm(body.places[0] - body.places[1]) for body in bodies])
+        return (measured_m - np.array([target.p1_p2_m for target in known])) / DISTANCE_SIGMA_M
+
+    return missed_by
 
 
 def calibration_sigma(evidence: Evidence, calibration: SelfCalibration) -> dict[str, Floats]:

@@ -76,6 +76,8 @@ def obstacles(project: Project, index: FrameIndex | None, reference: ReferenceFi
         yield "targets: none; add a roof with its search bands L1, L2 and T1"
     if project.method == "geometric" and project.inputs.lens is None:
         yield 'inputs.lens: missing, but method "geometric" needs it; calibrate with rooftrack lens, or choose "paper"'
+    if reference is not None and reference.is_hopeless:
+        yield str(reference.contradiction)
     for number, target in enumerate(project.targets):
         height = _height_obstacle if project.method == "geometric" else _scale_obstacle
         if (obstacle := height(project, target, reference)) is not None:
@@ -185,6 +187,8 @@ def _video_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
 
 
 def _correspondence_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
+    if inputs.reference is not None and inputs.reference.contradiction and not inputs.reference.is_hopeless:
+        yield inputs.reference.contradiction
     for pair in (pair for pair in project.correspondences if pair.enabled):
         if inputs.info and not _within_frame(pair.frame_px, inputs.info):
             u, v = pair.frame_px

@@ -21,6 +21,12 @@ from core.project import Correspondence
 COVERAGE_CELLS = 4
 # Standard deviations across the best line below which clicks count as collinear, as a part of their extent.
 COLLINEAR = 0.02
+# A click contradicts the others where it lies off their fit by more than this many metres, which no hand does, and by
+# this many times what is usual.
+CONTRADICTION_M = 0.3
+CONTRADICTION = 5.0
+# Beyond this the others are no use either, and search bands lie nowhere near their lines.
+HOPELESS_M = 5.0
 
 
 @dataclass(frozen=True)
@@ -67,6 +73,32 @@ class ReferenceFit:
     rms_m: float
     left_out_rms_px: float | None
     coverage: float
+
+    @property
+    def contradiction(self) -> str | None:
+        """What is wrong with the pair that contradicts the others most, if one does; a sentence without its end."""
+        worst = self._contradicting
+        if worst is None:
+            return None
+        return (
+            f"correspondences: id {worst.id} lies {worst.left_out_m:.2f} m from where the others put it; click it "
+            "again or disable it"
+        )
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether a pair contradicts the others so far that nothing can be measured by them."""
+        worst = self._contradicting
+        return worst is not None and (worst.left_out_m or 0.0) > HOPELESS_M
+
+    @property
+    def _contradicting(self) -> PairResidual | None:
+        known = [pair for pair in self.pairs if pair.enabled and pair.left_out_m is not None]
+        if len(known) < 5:
+            return None
+        off_m = np.array([pair.left_out_m for pair in known], dtype=np.float64)
+        worst = int(off_m.argmax())
+        return known[worst] if off_m[worst] > max(CONTRADICTION_M, CONTRADICTION * float(np.median(off_m))) else None
 
     def plan_from_raw(self, raw: Floats) -> Floats:
         """Return absolute plan metres (N, 2) of raw reference pixels (N, 2)."""
@@ -120,7 +152,7 @@ def fit_reference(
         elevation_m: (len(pairs),) of the ground clicks above the ground plane; zero where None.
 
     Raises:
-        InputError: fewer than four enabled pairs, collinear pairs, or pairs that contradict one another.
+        InputError: fewer than four enabled pairs, collinear pairs, or clicks where the lens model ends.
 
     Source: paper, "UAV Drift and Perspective Correction", first sub-step; planar pose after Zhang (2000).
     """

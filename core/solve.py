@@ -39,8 +39,10 @@ def solve(
         solution = solve_paper(recording, project, lens, relief, has_lens=has_lens)
     else:
         solution = solve_geometric(recording, project, lens, relief)
+    contradiction = solution.reference.contradiction
     return replace(
         solution,
+        warnings=(*([f"{contradiction}."] if contradiction else []), *solution.warnings),
         histories={
             target.name: filtered(unfiltered_history(solution, target, project.intervals_s), project.drift)
             for target in project.targets

@@ -29,7 +29,7 @@ from core.results import Status, TargetHistory
 from core.row_times import Readout, at_frame_times, estimated_readout, ground_speed
 from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution, TargetSolution, frame_status
-from core.uncertainty import GROUND_PART, Sigma, combined_sigma, common_error
+from core.uncertainty import GROUND_PART, Sigma, combined_sigma, common_error, jitter
 
 # Frames from which a rolling shutter is estimated.
 READOUT_FRAMES = 150
@@ -37,6 +37,10 @@ READOUT_FRAMES = 150
 READOUT_STEP_S = 1e-3
 # How far P1 and P2 may lie from their known distance: wrong by more are height, lens or bands, not the measurement.
 DISTANCE_TOLERANCE = 0.02
+# A building that moves by more than this in its pre-event, metres, and by so many times the noise, is not at rest or
+# not where it is thought to be.
+UNREST_M = 2e-3
+UNREST = 3.0
 
 
 def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: Relief | None = None) -> Solution:
@@ -113,11 +117,17 @@ def _warnings(project: Project, targets: Mapping[str, TargetSolution], heights_m
                 f"P1 and P2 of {target.name} lie {distance_m:.3f} m apart where it is {heights_m[target.name]:.2f} m "
                 f"high, but p1_p2_m is {given_m:.3f} m; check height_m, the lens and the bands."
             )
-        still = during(solved.history.time_s, project.intervals_s.pre_event)
-        if project.intervals_s.pre_event is not None and not (still & solved.history.measured).any():
+        still = during(solved.history.time_s, project.intervals_s.pre_event) & solved.history.measured
+        if project.intervals_s.pre_event is not None and not still.any():
             yield (
                 f"{target.name} was not measured in pre_event, so its displacement counts from the reference frame; "
                 "choose another pre_event."
+            )
+        moved_m = float(solved.history.p1_m[still].std(axis=0).max()) if still.any() else 0.0
+        if moved_m > max(UNREST_M, UNREST * float(jitter(solved.history.p1_m[still]).max())):
+            yield (
+                f"P1 of {target.name} moves by {1e3 * moved_m:.1f} mm (RMS) in pre_event, steadily and not as noise: "
+                "it shakes there already, or height_m, the lens or the clicks are wrong."
             )
 
 

@@ -13,6 +13,7 @@ from core.errors import InputError
 from core.georeference import ReferenceFit
 from core.ground import LEAST_POINTS, fit_homography
 from core.ground_poses import fit_with_relief
+from core.intervals import during
 from core.lens import Lens
 from core.measurements import Recording
 from core.motion import regress_lines
@@ -20,6 +21,7 @@ from core.project import Project, Target
 from core.relief import Relief
 from core.results import TargetHistory
 from core.solution import Ground, Solution, TargetSolution, frame_status
+from core.uncertainty import GROUND_PART, held_to_jitter
 
 
 def solve_paper(
@@ -102,10 +104,16 @@ def _solve_target(
     moved = scale * (places[1:] - places[0])
     angle = np.arctan2(*np.moveaxis(places[:, 0] - places[:, 1], -1, 0)[::-1])
     turned = np.angle(np.exp(1j * (angle[1:] - angle[0])))
-    sigma = scale * spread[1:]
+    # What the homography errs by moves the whole roof, whose points cannot tell.
+    pixel = np.array([[0.0, 0.0], [1.0 / float(lens.focal_px.mean()), 0.0]])
+    pixel_m = scale * float(np.linalg.norm(np.subtract(*apply_homography(reference.H_plan_ray, pixel))))
+    ground_m = GROUND_PART * ground.rms_px * pixel_m
     distance = float(np.linalg.norm(places[0, 0] - places[0, 1]))
     determined: Bools = np.isfinite(moved).all(axis=(1, 2))
     status = frame_status(recording, project, ground, lines.used[1:].sum(axis=1), determined)
+    still = during(recording.time_s, project.intervals_s.pre_event) & determined
+    sigma = held_to_jitter(np.hypot(scale * spread[1:], ground_m[:, None, None]), moved, still)
+    turned_sigma = held_to_jitter(np.sqrt((spread[1:] ** 2).sum(axis=(1, 2)) / 2) / distance, turned, still)
     history = TargetHistory(
         name=target.name,
         frame=recording.frame,
@@ -116,7 +124,7 @@ def _solve_target(
         rotation_rad=turned,
         p1_sigma_m=sigma[:, 0],
         p2_sigma_m=sigma[:, 1],
-        rotation_sigma_rad=np.sqrt((spread[1:] ** 2).sum(axis=(1, 2)) / 2) / distance,
+        rotation_sigma_rad=turned_sigma,
         p1_raw_m=moved[:, 0],
         p2_raw_m=moved[:, 1],
         rotation_raw_rad=turned,

@@ -107,6 +107,24 @@ def _by_scatter(sigma: Floats, value: Floats, most: float) -> Floats:
     return np.asarray(np.clip(value.std(axis=0) / np.sqrt((sigma**2).mean(axis=0)), LEAST_FACTOR, most))
 
 
+def jitter(values: Floats) -> Floats:
+    """Return the noise (...) of values (M, ...) in M frames, from how unevenly they follow each other; 0 of a few."""
+    if len(values) < 3:
+        return np.zeros(values.shape[1:])
+    return np.asarray(np.diff(values, n=2, axis=0).std(axis=0) / np.sqrt(6.0))
+
+
+def held_to_jitter(sigma: Floats, value: Floats, still: Bools) -> Floats:
+    """Return standard deviations (F, ...) of values that drift, as large as their noise at rest says.
+
+    Args:
+        still: (F,) measured frames of the stationary part.
+    """
+    if still.sum() < LEAST_STILL:
+        return sigma
+    return np.asarray(sigma * jitter(value[still]) / np.sqrt((sigma[still] ** 2).mean(axis=0)))
+
+
 def held_to_scatter(relative: TargetHistory, still: Bools) -> TargetHistory:
     """Return relative motion with standard deviations no larger than what it scatters by at rest says.
 

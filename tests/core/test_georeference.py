@@ -73,6 +73,21 @@ def test_four_clicks_are_enough_but_leave_none_to_check() -> None:
     assert all(pair.left_out_px is None for pair in fit.pairs)
 
 
+@pytest.mark.parametrize("off_m", [0.4, 2.0, 8.0])
+def test_a_click_that_contradicts_the_others_is_named(off_m: float) -> None:
+    pairs = clicks(noise_px=0.7)
+    assert fit_reference(pairs, LENS).contradiction is None
+    x, y = pairs[5].ground_m
+    pairs[5] = pairs[5].model_copy(update={"ground_m": (x + 0.8 * off_m, y - 0.6 * off_m)})
+    fit = fit_reference(pairs, LENS)
+    assert fit.contradiction is not None
+    assert f"id {pairs[5].id} lies {off_m:.0f}." in fit.contradiction or off_m < 1.0
+    assert f"id {pairs[5].id} " in fit.contradiction
+    assert fit.is_hopeless == (off_m > 5.0)
+    pairs[5] = pairs[5].model_copy(update={"enabled": False})
+    assert fit_reference(pairs, LENS).contradiction is None
+
+
 def test_relief_below_the_clicks_is_taken_into_account() -> None:
     elevation = 0.3 * np.sin(np.arange(len(PLACES)))
     pairs = clicks(elevation_m=elevation)

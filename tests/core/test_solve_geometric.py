@@ -132,6 +132,13 @@ def test_a_distance_that_is_not_the_known_one_is_told() -> None:
     assert any("P1 and P2 of roof lie" in warning and "check height_m, the lens" in warning for warning in wrong)
 
 
+def test_a_pre_event_in_which_the_building_moves_is_told() -> None:
+    recording = scene.recording(NOISE_PX)
+    assert not any("steadily" in warning for warning in solved(recording).warnings)
+    shaken = solved(recording, intervals_s={"pre_event": [0.0, 5.0], "event": [5.0, 6.0], "residual": [6.5, 7.9]})
+    assert any("P1 of roof moves by" in warning and "steadily" in warning for warning in shaken.warnings)
+
+
 @pytest.mark.filterwarnings("error")
 def test_a_pre_event_in_which_nothing_was_measured_is_told() -> None:
     recording = scene.recording(NOISE_PX)
@@ -300,6 +307,22 @@ def test_a_wrong_lens_is_corrected_from_what_stands_still() -> None:
     # Its own uncertainty covers what it misses: the truth lies within three standard deviations.
     off = [found.correction[2] + 2.0, found.correction[3] - 1.5]
     assert (np.abs(off) < 3 * found.sigma[2:4]).all()
+
+
+def test_a_known_distance_corrects_the_scale() -> None:
+    # A short and noisy pre-event, which leaves the scale at the roof half open; lens and height are wrong.
+    off = 1.0 + 2 * scene.LENS.sigma.focal_relative
+    matrix = scene.LENS.camera_matrix * np.array([[off, 1.0, 1.0], [1.0, off, 1.0], [1.0, 1.0, 1.0]])
+    lens = replace(scene.LENS, camera_matrix=matrix)
+    roof = scene.project_document().targets[0].model_dump(by_alias=True)
+    distance_m = float(np.linalg.norm(np.subtract(*solved(scene.recording()).targets["roof"].rest_m)))
+
+    def scale_error(known_m: float | None) -> float:
+        target = {**roof, "height_m": scene.HEIGHT_M + 0.04, "p1_p2_m": known_m}
+        found = solved(scene.recording(0.3), lens, targets=[target], intervals_s={"pre_event": [0.0, 1.2]})
+        return abs(float(np.linalg.norm(np.subtract(*found.targets["roof"].rest_m))) / distance_m - 1.0)
+
+    assert scale_error(distance_m) < 0.5 * scale_error(None)
 
 
 def test_the_rest_after_the_event_calibrates_too() -> None:

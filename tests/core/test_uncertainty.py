@@ -5,7 +5,16 @@ import pytest
 
 from core.coordinates import Floats
 from core.results import TargetHistory
-from core.uncertainty import LEAST_STILL, MOVING, Sigma, combined_sigma, common_error, held_to_scatter
+from core.uncertainty import (
+    LEAST_STILL,
+    MOVING,
+    Sigma,
+    combined_sigma,
+    common_error,
+    held_to_jitter,
+    held_to_scatter,
+    jitter,
+)
 
 FRAMES = 400
 STILL = np.arange(FRAMES) < 150
@@ -35,6 +44,17 @@ def test_error_bars_are_held_against_the_scatter_at_rest(places_m: Floats) -> No
     sigma = combined(places_m)
     np.testing.assert_allclose(sigma.places_m[STILL].mean(axis=0), places_m[STILL].std(axis=0), rtol=1e-6)
     np.testing.assert_allclose(sigma.rotation_rad[STILL].mean(), 1e-5, rtol=0.2)
+
+
+def test_noise_is_told_from_drift() -> None:
+    noise = np.random.default_rng(5).normal(scale=[3e-4, 6e-4], size=(FRAMES, 2))
+    drift = 0.05 * np.sin(np.arange(FRAMES) / 40)[:, None]
+    np.testing.assert_allclose(jitter(noise + drift), [3e-4, 6e-4], rtol=0.1)
+    held = held_to_jitter(np.full((FRAMES, 2), 1e-5), noise + drift, STILL)
+    np.testing.assert_allclose(held.mean(axis=0), [3e-4, 6e-4], rtol=0.15)
+    few = np.arange(FRAMES) < LEAST_STILL - 1
+    np.testing.assert_array_equal(held_to_jitter(np.full((FRAMES, 2), 1e-5), noise, few), 1e-5)
+    assert not jitter(noise[:2]).any()
 
 
 def test_error_bars_widen_where_the_roof_moves_and_not_after(places_m: Floats) -> None:
