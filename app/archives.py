@@ -192,7 +192,7 @@ def _unpack(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> N
                 if left < 0:
                     raise Invalid(f"The archive lies about the size of {entry.filename!r}; it was not unpacked.")
                 stream.write(piece)
-        # By their times it is told whether results are older than inputs.
+        # A person tells by their times which of two files is the older one.
         packed_s = time.mktime((*entry.date_time, 0, 0, -1))
         os.utime(target, (packed_s, packed_s))
     except FileExistsError:

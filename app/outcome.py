@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from app.errors import ApiError, NotYet
-from app.frames import Fingerprint, file_of, fingerprint
+from app.frames import Fingerprint, file_of, fingerprint, identity
 from app.jobs import JOB_FILE
 from app.store import ProjectFolder, read_json, stored_inputs
 from app.videos import video_info
@@ -31,7 +31,7 @@ from core.results import TargetHistory, read_history_csv
 from core.run import FRAMES_FILE, LoadedInputs, load_inputs, program_version, relief_plan
 from core.solution import Solution
 from core.solve import solve
-from core.storage import File, file_at
+from core.storage import File
 from core.video import frame_index
 
 METHODS: tuple[Method, ...] = ("geometric", "paper")
@@ -111,15 +111,16 @@ def _is_stale(folder: ProjectFolder, project: Project, summary: dict[str, Any]) 
     then = summary.get("settings")
     if not isinstance(then, dict) or {**then, "name": ""} != {**now, "name": ""}:
         return True
-    made_s = (folder.results / SUMMARY_FILE).stat().st_mtime
-    for file in stored_inputs(project.inputs).values():
-        try:
-            near = None if file is None else file_at(folder.folder, file)
-            if isinstance(near, Path) and near.stat().st_mtime > made_s:
-                return True
-        except OSError:
-            return True
-    return False
+    return summary.get("identity") != _identities(folder, project)
+
+
+def _identities(folder: ProjectFolder, project: Project) -> dict[str, str] | None:
+    """Return a name for the content of each input, by its path as the project names it; None where one is not there."""
+    try:
+        files = {stored: folder.input_file(kind, project) for kind, stored in stored_inputs(project.inputs).items()}
+        return {stored: identity(file) for stored, file in files.items() if stored is not None and file is not None}
+    except (InputError, ApiError):
+        return None
 
 
 def _frames_total(folder: ProjectFolder, project: Project, exactly: bool) -> int:
@@ -336,6 +337,7 @@ def _results_of(folder: ProjectFolder, project: Project, found: Solved) -> Resul
         gps=found.inputs.gps,
         video=found.inputs.video,
         sha256={},
+        identity={},
         version=program_version(),
         frames_measured=0,
         measuring_s=0.0,

@@ -143,6 +143,7 @@ def run_project(
             gps=inputs.gps,
             video=inputs.video,
             sha256={file: sha256_of(file_at(folder, file), results) for file in input_files(inputs.project)},
+            identity={file: content_identity(file_at(folder, file)) for file in input_files(inputs.project)},
             version=program_version(),
             frames_measured=new,
             measuring_s=measured_s,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -141,6 +142,30 @@ def test_a_changed_project_makes_files_stale_and_is_solved_at_once(tracked: Test
     finally:
         tracked.post(f"{CLIP}/undo", json={"revision": changed["revision"]})
     assert not tracked.get(f"{CLIP}/results").json()["stale"]
+
+
+def test_results_are_fresh_while_the_content_of_every_input_is_that_of_the_run(tracked: TestClient) -> None:
+    workspace: Path = tracked.app.state.context.workspace.folder  # type: ignore[attr-defined]
+    lens = workspace / "clip" / "lens.yaml"
+    measured_with, made_s = lens.read_text(), lens.stat().st_mtime
+
+    def is_stale(text: str, modified_s: float) -> bool:
+        lens.write_text(text)
+        os.utime(lens, (modified_s, modified_s))
+        return bool(tracked.get(f"{CLIP}/results").json()["stale"])
+
+    other = measured_with + "# another lens\n"
+    try:
+        assert is_stale(other, made_s - 86_400)
+        assert is_stale(other, made_s + 86_400)
+        assert not is_stale(measured_with, made_s + 86_400)
+    finally:
+        assert not is_stale(measured_with, made_s)
+
+
+def test_results_are_fresh_when_they_come_back_from_an_archive(tracked: TestClient) -> None:
+    made = tracked.post("/api/projects/restore", content=tracked.get(f"{CLIP}/archive").content).json()["id"]
+    assert not tracked.get(f"/api/projects/{made}/results").json()["stale"]
 
 
 def test_the_scene_shows_camera_and_roof_lines_in_step_with_a_frame(tracked: TestClient) -> None:
