@@ -184,16 +184,29 @@ class ProjectFolder:
         file = self.input_file(kind, project)
         return file.is_file() if isinstance(file, Path) else file is not None
 
-    def free_name(self, wanted: str) -> str:
-        """Return a file name for the project folder, as wanted but free of what could do harm.
+    def take_in(self, kind: str, part: Path, wanted: str) -> Saved:
+        """Make what was received an input, under the name it came with or the next free one.
 
-        Raises:
-            Invalid: nothing usable is left of it, or the project itself uses the name.
+        What this very input was may be replaced; a file of another input, or one that is no input, never is.
         """
-        name = re.sub(r"[^\w .()+-]", "_", Path(wanted.replace("\\", "/")).name).strip(" .")[-120:]
-        if not name or name.lower() in _RESERVED or name.startswith("."):
-            raise Invalid(f"{wanted!r} cannot be the name of an input; rename the file.", path="filename")
-        return name
+        with self._lock:
+            name = self._free_name(wanted, kind)
+            os.replace(part, self.folder / name)
+            return self.change_input(kind, self.folder / name, label=f"take in {kind} {name}")
+
+    def _free_name(self, wanted: str, kind: str) -> str:
+        name = plain_name(wanted)
+        number, candidate = 1, Path(name)
+        while self._is_taken(candidate.name, kind):
+            number += 1
+            candidate = candidate.with_name(f"{Path(name).stem}-{number}{candidate.suffix}")
+        return candidate.name
+
+    def _is_taken(self, name: str, kind: str) -> bool:
+        """Whether a file of the project folder is anything but this kind of input."""
+        named = stored_inputs(self._read().inputs)
+        kinds = {other for other, file in named.items() if file and os.path.normpath(file) == name}
+        return bool(kinds - {kind}) or (not kinds and os.path.lexists(self.folder / name))
 
     def part_file(self) -> Path:
         """Return a place for something that is still coming in."""
@@ -244,6 +257,18 @@ class ProjectFolder:
     def _store(self, project: Project, *, label: str, merge: bool = False) -> Saved:
         write_project(self.folder, project)
         return Saved(project, self._history.record(label, project_json(project), merge=merge))
+
+
+def plain_name(wanted: str) -> str:
+    """Return a file name for the project folder, as wanted but free of what could do harm.
+
+    Raises:
+        Invalid: nothing usable is left of it, or the project itself uses the name.
+    """
+    name = re.sub(r"[^\w .()+-]", "_", Path(wanted.replace("\\", "/")).name).strip(" .")[-120:]
+    if not name or name.lower() in _RESERVED or name.startswith("."):
+        raise Invalid(f"{wanted!r} cannot be the name of an input; rename the file.", path="filename")
+    return name
 
 
 def stored_inputs(inputs: Inputs) -> dict[str, str | None]:
