@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from app.errors import Busy, Missing
 from app.events import Hub
-from app.store import ProjectFolder, Workspace, read_json
+from app.store import ProjectFolder, read_json
 from core.errors import InputError
 from core.project import write_atomically
 
@@ -205,19 +205,15 @@ class Jobs:
         for job in active:
             self._await_end(job)
 
-    def go_on(self, workspace: Workspace, finishes: dict[str, Finish]) -> list[tuple[ProjectFolder, Job]]:
-        """Go on with the tracking that ran when the last server of this workspace stopped; return what was started."""
-        started = []
-        for project in workspace.projects():
-            note = read_json(project.results / JOB_FILE)
-            if not isinstance(note, dict) or note.get("state") not in ("running", "interrupted"):
-                continue
-            if note.get("kind") == _RESUMED:
-                parameters = {**(note.get("parameters") or {}), "fresh": False}
-                started.append((project, self.start(project, _RESUMED, parameters, finishes.get(_RESUMED))))
-            else:
-                (project.results / JOB_FILE).unlink(missing_ok=True)
-        return started
+    def go_on(self, project: ProjectFolder, finish: Finish) -> Job | None:
+        """Go on with the tracking of a project that ran when the last server stopped; None where none did."""
+        note = read_json(project.results / JOB_FILE)
+        if not isinstance(note, dict) or note.get("state") not in ("running", "interrupted"):
+            return None
+        if note.get("kind") != _RESUMED:
+            (project.results / JOB_FILE).unlink(missing_ok=True)
+            return None
+        return self.start(project, _RESUMED, {**(note.get("parameters") or {}), "fresh": False}, finish)
 
     def _await_end(self, job: Job) -> None:
         watcher = self._watchers.get(job.id)

@@ -69,11 +69,6 @@ class ProjectFolder:
         """Folder of everything that can be computed again."""
         return self.folder / RESULTS_FOLDER
 
-    @property
-    def updated_s(self) -> float:
-        """When the project was last edited, seconds since the epoch."""
-        return (self.folder / PROJECT_FILE).stat().st_mtime
-
     def load(self) -> Saved:
         """Return the project and its revision.
 
@@ -307,10 +302,14 @@ class Workspace:
         self._open: dict[str, ProjectFolder] = {}
         self._lock = threading.Lock()
 
-    def projects(self) -> Iterator[ProjectFolder]:
-        """Yield the projects, the last edited first."""
+    def ids(self) -> list[str]:
+        """Return the ids of all projects, the last edited first; `open` may refuse one that is a link to elsewhere."""
         found = [path.name for path in self.folder.iterdir() if _ID.fullmatch(path.name) and _is_project(path)]
-        yield from sorted((self.open(name) for name in found), key=lambda project: -project.updated_s)
+        return sorted(found, key=lambda name: -self.updated_s(name))
+
+    def updated_s(self, project_id: str) -> float:
+        """Return when a project was last edited, seconds since the epoch."""
+        return 1e-9 * _modified_ns(self.folder / project_id / PROJECT_FILE)
 
     def open(self, project_id: str) -> ProjectFolder:
         """Return a project by its id, the name of its folder.

@@ -193,6 +193,23 @@ def test_a_broken_project_file_is_listed_with_its_problem(client: TestClient, wo
     assert (answer.status_code, answer.json()["error"]["kind"]) == (422, "input")
 
 
+def test_a_project_that_leads_elsewhere_is_listed_with_its_problem_and_keeps_no_server_from_starting(
+    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (workspace / "small").rename(tmp_path / "elsewhere")
+    (workspace / "small").symlink_to(tmp_path / "elsewhere")
+    half_sent = workspace / "near" / ".incoming-0123456789abcdef"
+    half_sent.parent.mkdir()
+    half_sent.touch()
+    (workspace / "near" / "project.json").write_bytes((tmp_path / "elsewhere" / "project.json").read_bytes())
+    with TestClient(create_app(workspace), base_url=ADDRESS, headers=WRITE) as client:
+        listed = {project["id"]: project for project in client.get("/api/projects").json()}
+    assert "outside the folders" in listed["small"]["steps"]["inputs"]["message"]
+    assert listed["near"]["name"] == "small"
+    assert not half_sent.exists()
+
+
 def test_the_trash_is_emptied_after_a_month(client: TestClient, context: Context, workspace: Path) -> None:
     old, new = (client.delete(f"/api/projects/{name}").json()["undo_token"] for name in _two_projects(client))
     month_ago_s = time.time() - 32 * 86_400
