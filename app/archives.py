@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
 from app.errors import Invalid
-from app.history import HISTORY_FILE
+from app.history import DAMAGED_FILE, HISTORY_FILE
 from app.jobs import JOB_FILE
 from app.store import CACHE_FOLDER, RESULTS_FOLDER, ProjectFolder, Workspace, stored_inputs, with_inputs
 from app.uploads import SPARE_BYTES
@@ -65,7 +65,7 @@ def _inside_inputs(project: ProjectFolder, stored: Project) -> set[Path]:
 
 
 def _files(project: ProjectFolder, left_out: set[Path]) -> Iterator[Path]:
-    own = {PROJECT_FILE, HISTORY_FILE, f"{RESULTS_FOLDER}/{JOB_FILE}"}
+    own = {PROJECT_FILE, HISTORY_FILE, DAMAGED_FILE, f"{RESULTS_FOLDER}/{JOB_FILE}"}
     for folder, folders, names in os.walk(project.folder):
         folders[:] = sorted(name for name in folders if not name.startswith(".") and name != CACHE_FOLDER)
         for name in sorted(names):
