@@ -27,8 +27,7 @@ from core.errors import InputError
 from core.project import write_atomically
 
 JOB_FILE = "job.json"
-State = Literal["queued", "running", "done", "failed", "cancelled", "interrupted"]
-ACTIVE: tuple[State, ...] = ("queued", "running")
+State = Literal["running", "done", "failed", "cancelled", "interrupted"]
 # Reading a cloud for the eye disturbs nobody, so it may run beside one of the others.
 _BESIDE = "cloud"
 # What goes on by itself when the server comes back: nothing a person has to decide, and hours may have gone into it.
@@ -52,7 +51,7 @@ class Job:
     project: str
     kind: str
     parameters: dict[str, Any]
-    state: State = "queued"
+    state: State = "running"
     stage: str = ""
     done: int = 0
     total: int = 0
@@ -75,6 +74,11 @@ class Job:
             self._marks.popleft()
 
     @property
+    def is_running(self) -> bool:
+        """Whether it has not ended yet."""
+        return self.state == "running"
+
+    @property
     def rate_per_s(self) -> float | None:
         """Units a second over the last few seconds."""
         if len(self._marks) < 2:
@@ -84,7 +88,7 @@ class Job:
 
     def as_json(self) -> dict[str, Any]:
         """Return the job as the browser gets it."""
-        rate = self.rate_per_s if self.state == "running" else None
+        rate = self.rate_per_s if self.is_running else None
         return {
             "id": self.id,
             "project": self.project,
@@ -126,6 +130,7 @@ class Jobs:
 
         Raises:
             Busy: another job of this project is running.
+            InputError: this computer cannot start one now.
         """
         with self._lock:
             running = self.running(project.id, kind)
@@ -135,21 +140,31 @@ class Jobs:
                     job=running.as_json(),
                 )
             job = Job(id=secrets.token_hex(8), project=project.id, kind=kind, parameters=parameters or {})
-            self._jobs[job.id] = job
+            try:
+                self._launch(project, job, finish)
+            except (OSError, RuntimeError) as error:
+                raise InputError(
+                    f"{_spoken(kind)} could not be started ({error}); make room on the disk and in memory, try again."
+                ) from None
             self._forget_oldest()
-            process = _spawn()
-            self._processes[job.id] = process
-            job.state = "running"
-            self._note(project, job)
-            order = {"kind": kind, "folder": str(project.folder), "parameters": job.parameters}
-            _send(process, json.dumps(order))
-            watcher = threading.Thread(
-                target=self._watch, args=(project, job, process, finish), name=f"job {kind}", daemon=True
-            )
-            self._watchers[job.id] = watcher
-            watcher.start()
         self._tell(job)
         return job
+
+    def _launch(self, project: ProjectFolder, job: Job, finish: Finish | None) -> None:
+        """Start a job's worker and its watcher; a job that cannot have both leaves nothing behind."""
+        process = _spawn()
+        try:
+            self._note(project, job)
+            order = {"kind": job.kind, "folder": str(project.folder), "parameters": job.parameters}
+            _send(process, json.dumps(order))
+            args = (project, job, process, finish)
+            watcher = threading.Thread(target=self._watch, args=args, name=f"job {job.kind}", daemon=True)
+            watcher.start()
+        except BaseException:
+            process.kill()
+            process.communicate()
+            raise
+        self._jobs[job.id], self._processes[job.id], self._watchers[job.id] = job, process, watcher
 
     def get(self, job_id: str) -> Job:
         """Return a job.
@@ -166,7 +181,7 @@ class Jobs:
         """Return the running job of a project that a job of this kind would have to wait for."""
         for job in list(self._jobs.values()):
             beside = (job.kind == _BESIDE) != (kind == _BESIDE)
-            if job.project == project_id and job.state in ACTIVE and not beside:
+            if job.project == project_id and job.is_running and not beside:
                 return job
         return None
 
@@ -178,7 +193,7 @@ class Jobs:
     def cancel(self, job: Job) -> None:
         """Ask a job to stop; the answer comes when it has."""
         process = self._processes.get(job.id)
-        if job.state in ACTIVE and process is not None and not job.asked_to_stop:
+        if job.is_running and process is not None and not job.asked_to_stop:
             job.asked_to_stop = True
             job.message = "Stopping after the frame it is in."
             _send(process, "cancel")
@@ -189,13 +204,13 @@ class Jobs:
 
     def cancel_all(self, project_id: str) -> None:
         """Stop every job of a project and wait until none of them writes any more."""
-        for job in [job for job in list(self._jobs.values()) if job.project == project_id and job.state in ACTIVE]:
+        for job in [job for job in list(self._jobs.values()) if job.project == project_id and job.is_running]:
             self.cancel(job)
             self._await_end(job)
 
     def close(self) -> None:
         """Stop every job because the server stops; tracking will go on when it is back."""
-        active = [job for job in list(self._jobs.values()) if job.state in ACTIVE]
+        active = [job for job in list(self._jobs.values()) if job.is_running]
         for job in active:
             process = self._processes.get(job.id)
             if job.kind == _BESIDE and process is not None:
@@ -286,7 +301,7 @@ class Jobs:
         self._hub.publish(job.project, "job", job.as_json())
 
     def _forget_oldest(self) -> None:
-        over = [job.id for job in self._jobs.values() if job.state not in ACTIVE][: len(self._jobs) - _JOBS_KEPT]
+        over = [job.id for job in self._jobs.values() if not job.is_running][: len(self._jobs) - _JOBS_KEPT]
         for job_id in over if len(self._jobs) > _JOBS_KEPT else ():
             del self._jobs[job_id]
 

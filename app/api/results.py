@@ -84,7 +84,7 @@ def track_state(folder: Folder, here: Here) -> dict[str, Any]:
     """Return how far the measurement is, and the displacement so far."""
     project = folder.load().project
     job = _running(here, folder) or here.jobs.latest(folder.id, "track")
-    running = job is not None and job.state in ("queued", "running")
+    running = job is not None and job.is_running
     state = outcome.state_of(folder, project)
     resumable = not running and state.frames_done > 0 and not state.finished
     message = "" if job is None else job.message

@@ -1,0 +1,59 @@
+"""Jobs when the computer fails them: no room on the disk, no memory for another process, a worker that is killed."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app import jobs
+
+SMALL = "/api/projects/small"
+
+
+@pytest.fixture
+def workers(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[str]]:
+    """Every worker that is started."""
+    started: list[subprocess.Popen[str]] = []
+    spawn = jobs._spawn
+
+    def kept() -> subprocess.Popen[str]:
+        started.append(spawn())
+        return started[-1]
+
+    monkeypatch.setattr(jobs, "_spawn", kept)
+    return started
+
+
+def no_memory() -> Any:
+    raise OSError(12, "Cannot allocate memory")
+
+
+def full_disk(*_: Any) -> None:
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("part", "fails", "told"),
+    [("_spawn", no_memory, "Cannot allocate memory"), ("write_atomically", full_disk, "No space left on device")],
+)
+def test_a_job_that_cannot_be_started_is_told_and_blocks_no_other(
+    client: TestClient,
+    workers: list[subprocess.Popen[str]],
+    finished: Callable[[dict[str, Any]], dict[str, Any]],
+    part: str,
+    fails: Callable[..., Any],
+    told: str,
+) -> None:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(jobs, part, fails)
+        answer = client.post(f"{SMALL}/track")
+    assert answer.status_code == 422
+    assert answer.json()["error"]["message"].startswith("Tracking could not be started")
+    assert told in answer.json()["error"]["message"]
+    assert client.get(f"{SMALL}/track").json()["job"] is None
+    assert all(worker.poll() is not None for worker in workers)
+    assert finished(client.post(f"{SMALL}/track").json()["job"])["state"] in ("done", "failed")
