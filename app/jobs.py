@@ -283,7 +283,10 @@ class Jobs:
             state, message = "failed", str(error)
         with self._lock:
             job.message, job.state = message, state
-            self._note(project, job)
+            try:
+                self._note(project, job)
+            except OSError as error:  # the tabs have to hear all the more that it is over
+                log.error("the end of job %s of %s could not be noted: %s", job.kind, job.project, error)
             self._processes.pop(job.id, None)
             self._watchers.pop(job.id, None)
         self._tell(job)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app import jobs
+from app.context import Context
 
 SMALL = "/api/projects/small"
 
@@ -28,12 +30,31 @@ def workers(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[str]]:
     return started
 
 
+def wait_until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
 def no_memory() -> Any:
     raise OSError(12, "Cannot allocate memory")
 
 
 def full_disk(*_: Any) -> None:
     raise OSError(28, "No space left on device")
+
+
+def test_a_full_disk_hides_no_end_of_a_job(
+    client: TestClient, context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[tuple[str, str]] = []
+    monkeypatch.setattr(context.hub, "publish", lambda project, event, data: said.append((event, data.get("state"))))
+    job = context.jobs.get(client.post(f"{SMALL}/track").json()["job"]["id"])
+    monkeypatch.setattr(jobs, "write_atomically", full_disk)
+    wait_until(lambda: not job.is_running)
+    wait_until(lambda: ("job", job.state) in said)
+    assert context.jobs.running("small", "track") is None
 
 
 @pytest.mark.parametrize(
