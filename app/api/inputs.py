@@ -108,8 +108,14 @@ def _take_in(here: Context, folder: ProjectFolder, kind: UploadKind, part: Path,
 
 
 @router.get("/projects/{project_id}/inputs")
-def inputs(folder: Folder, here: Here) -> dict[str, Any]:
-    """Return what was understood of each input: null, an error, or its facts."""
+def inputs(folder: Folder, here: Here, again: bool = False) -> dict[str, Any]:
+    """Return what was understood of each input: null, an error, or its facts.
+
+    Args:
+        again: whether a cloud is read anew where reading it broke off.
+    """
+    if again:
+        here.sites.forget_failure(folder)
     project = folder.load().project
     return {kind: _understood(here, folder, project, kind) for kind in INPUT_KINDS}
 

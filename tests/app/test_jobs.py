@@ -78,3 +78,22 @@ def test_a_job_that_cannot_be_started_is_told_and_blocks_no_other(
     assert client.get(f"{SMALL}/track").json()["job"] is None
     assert all(worker.poll() is not None for worker in workers)
     assert finished(client.post(f"{SMALL}/track").json()["job"])["state"] in ("done", "failed")
+
+
+def test_a_killed_reading_of_the_cloud_is_told_and_begins_anew_when_asked_to(
+    client: TestClient, context: Context, workers: list[subprocess.Popen[str]]
+) -> None:
+    def cloud(**asked: int) -> dict[str, Any]:
+        found: dict[str, Any] = client.get(f"{SMALL}/inputs", params=asked).json()["cloud"]
+        return found
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(jobs, "_send", lambda worker, line: worker.kill())
+        assert cloud()["reading"]
+    wait_until(lambda: context.jobs.running("small", "cloud") is None)
+    assert "broke off unexpectedly" in cloud()["error"]["message"]
+    scene = client.post(f"{SMALL}/scene", json={"frame": 0})
+    assert (scene.status_code, "broke off" in scene.json()["error"]["message"]) == (422, True)
+    assert len(workers) == 1
+    assert cloud(again=1)["reading"]
+    wait_until(lambda: "points" in cloud())
