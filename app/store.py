@@ -29,7 +29,7 @@ from core.project import (
     project_problems,
     write_project,
 )
-from core.storage import File, file_at
+from core.storage import FarFile, File, file_at
 
 _AnyFile = TypeVar("_AnyFile", bound=File)
 
@@ -95,7 +95,7 @@ class ProjectFolder:
         with self._lock:
             saved = self.load()
             inputs = saved.project.inputs.model_dump()
-            stored = None if file is None else self._relative(file)
+            stored = None if file is None else self._named(self._places.allowed(os.path.abspath(file)))
             if kind == "gps" and stored is not None:
                 inputs["gps"] = {**(inputs["gps"] or {}), "file": stored}
             else:
@@ -136,14 +136,7 @@ class ProjectFolder:
             Refused: outside the allowed folders.
         """
         stored = stored_inputs((project or self.load().project).inputs)[kind]
-        if stored is None:
-            return None
-        file = file_at(self.folder, stored) if kind == "video" else self.folder / stored
-        if isinstance(file, Path):
-            return self._places.allowed(os.path.abspath(file))
-        if file.is_near:
-            raise Refused(f"{file}: is a file of this computer; name it by its path.", path=f"inputs.{kind}")
-        return file
+        return None if stored is None else self._file_of(kind, stored)
 
     def input_path(self, kind: str, project: Project | None = None) -> Path | None:
         """Return where an input lies on this computer, or None where none is given there.
@@ -238,16 +231,30 @@ class ProjectFolder:
         project = Project.model_validate(document)
         before = stored_inputs(self._read().inputs)
         changed = {kind: file for kind, file in stored_inputs(project.inputs).items() if file != before[kind]}
-        relative = {kind: self._relative(self.folder / file) for kind, file in changed.items() if file is not None}
-        return project.model_copy(update={"inputs": with_inputs(project.inputs, relative)})
+        named = {kind: self._named(self._file_of(kind, file)) for kind, file in changed.items() if file is not None}
+        return project.model_copy(update={"inputs": with_inputs(project.inputs, named)})
 
-    def _relative(self, file: Path) -> str:
-        """How an input is written into the project: from its folder, so that both may be moved together."""
-        real = self._places.allowed(os.path.abspath(file))
+    def _file_of(self, kind: str, stored: str) -> File:
+        """Return where an input that is written into the project so lies.
+
+        Raises:
+            Refused: outside the allowed folders.
+        """
+        file = file_at(self.folder, stored) if kind == "video" else self.folder / stored
+        if isinstance(file, Path):
+            return self._places.allowed(os.path.abspath(file))
+        if file.is_near:
+            raise Refused(f"{file}: is a file of this computer; name it by its path.", path=f"inputs.{kind}")
+        return file
+
+    def _named(self, file: File) -> str:
+        """How an input is written into the project: by its address, or from the folder, so that both may be moved."""
+        if isinstance(file, FarFile):
+            return file.address
         try:
-            return Path(os.path.relpath(real, self.folder)).as_posix()
+            return Path(os.path.relpath(file, self.folder)).as_posix()
         except ValueError:  # another drive on Windows
-            return real.as_posix()
+            return file.as_posix()
 
     def _store(self, project: Project, *, label: str, merge: bool = False) -> Saved:
         write_project(self.folder, project)

@@ -315,3 +315,17 @@ def test_an_address_leads_to_no_file_of_this_computer(client: TestClient, worksp
     answer = client.get(f"{SMALL}/frames/0.jpg")
     assert answer.status_code == 403
     assert "name it by its path" in answer.json()["error"]["message"]
+
+
+def test_an_address_that_is_typed_is_kept_as_it_is(client: TestClient, workspace: Path) -> None:
+    def typed(address: str) -> Any:
+        state = client.get(SMALL).json()
+        project = state["project"] | {"inputs": state["project"]["inputs"] | {"video": address}}
+        return client.put(SMALL, json={"project": project, "revision": state["revision"]})
+
+    address = "memory://campaign/typed.mp4"
+    assert typed(address).json()["project"]["inputs"]["video"] == address
+    assert json.loads((workspace / "small" / "project.json").read_text())["inputs"]["video"] == address
+    refused = typed("file:///etc/hostname")
+    assert (refused.status_code, "name it by its path" in refused.json()["error"]["message"]) == (403, True)
+    assert typed(str(workspace / "small" / "video.mp4")).json()["project"]["inputs"]["video"] == "video.mp4"
