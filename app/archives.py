@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import lzma
 import os
 import shutil
 import stat
 import time
 import zipfile
+import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
@@ -27,6 +29,17 @@ _PACKED_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".laz", ".jpg", ".jpeg", ".p
 _MAX_FILES = 20_000
 _MAX_RATIO = 100
 _FREE_BYTES = 64 << 20
+# What reading a damaged zip raises, wherever the damage is: its directory, a header, or what was packed.
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zipfile.LargeZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    NotImplementedError,
+    EOFError,
+    OSError,
+    UnicodeError,
+)
 
 
 def archive_stream(project: ProjectFolder, *, inputs: bool) -> Iterator[bytes]:
@@ -132,7 +145,7 @@ def restore(workspace: Workspace, archive_file: Path, name: str | None) -> Proje
             project = project.model_copy(update={"name": name})
         write_project(folder, project)
         return workspace.adopt(folder, project.name)
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, EOFError, OSError, UnicodeError) as error:
+    except _DAMAGE as error:
         raise Invalid(f"The archive is damaged or no zip file ({error}); choose one made by Rooftrack.") from None
     except RuntimeError:
         raise Invalid("The archive is encrypted; unpack it and pack it again without a password.") from None
