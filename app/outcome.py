@@ -9,7 +9,7 @@ from __future__ import annotations
 import sqlite3
 import threading
 from collections import OrderedDict
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -282,8 +282,7 @@ class Outcomes:
 
 
 def _solve(folder: ProjectFolder, project: Project, method: Method) -> Solved:
-    inputs = loaded(folder, project)
-    inputs = replace(inputs, project=by_method(project, method))
+    inputs = loaded(folder, by_method(project, method))
     wanted = _wanted(fingerprint(folder.require_video(project)), inputs.project)
     with MeasurementStore(folder.results / FRAMES_FILE) as store:
         number = store.find(method, wanted)
@@ -312,7 +311,7 @@ def loaded(folder: ProjectFolder, project: Project) -> LoadedInputs:
     plan = relief_plan(folder.folder, project)
     if plan is not None and not plan.file.is_file():
         raise NotYet("The ground is being taken from the cloud; it takes a moment.", path="inputs.cloud")
-    return load_inputs(folder.folder)
+    return load_inputs(folder.folder, project=project)
 
 
 @lru_cache(maxsize=8)

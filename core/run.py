@@ -169,13 +169,16 @@ def _only_writer(results: Path) -> Iterator[None]:
         yield
 
 
-def load_inputs(folder: Path, progress: Progress = silent) -> LoadedInputs:
+def load_inputs(folder: Path, progress: Progress = silent, *, project: Project | None = None) -> LoadedInputs:
     """Open everything a project names.
+
+    Args:
+        project: in that folder, as `project.json` has it where None.
 
     Raises:
         InputError: something is missing, malformed or does not fit together.
     """
-    project = read_project(folder)
+    project = project or read_project(folder)
     video = file_at(folder, project.inputs.video)
     info = probe(video)
     lens = _lens_of(folder, project, video, info)
