@@ -26,7 +26,7 @@ from core.export import SUMMARY_FILE, GpsCheck, Results, compared_with_gps
 from core.lens import Lens
 from core.measurements import FrameMeasurement, MeasurementStore, Recording
 from core.prediction import MeasureSetup
-from core.project import Drift, Method, Project, project_json
+from core.project import Drift, Method, Project, Target, project_json
 from core.results import TargetHistory, read_history_csv
 from core.run import FRAMES_FILE, LoadedInputs, load_inputs, program_version, relief_plan
 from core.solution import Solution
@@ -159,33 +159,31 @@ def wanted_fingerprint(video: File, project: Project) -> str:
 
 
 def _wanted(video: Fingerprint, project: Project) -> str:
-    decided = project.model_dump_json(include={"reference_frame", "moving_regions_px", "targets", "method"})
-    return _wanted_fingerprint(video, decided, _Hidden(project))
-
-
-class _Hidden:
-    """A project that takes no part in a cache's key, because another argument says what matters of it."""
-
-    def __init__(self, project: Project) -> None:
-        self.project = project
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Hidden)
-
-    def __hash__(self) -> int:
-        return 0
-
-
-@lru_cache(maxsize=64)
-def _wanted_fingerprint(video: Fingerprint, decided: str, hidden: _Hidden) -> str:
-    """Return the engine's name for what is to be measured; the geometry, left out here, takes no part in it."""
-    project = hidden.project
-    setup = MeasureSetup(
-        video=file_of(video),
+    return _wanted_fingerprint(
+        video,
         reference_frame=project.reference_frame,
         moving_regions_px=project.moving_regions_px,
         targets=project.targets,
         method=project.method,
+    )
+
+
+@lru_cache(maxsize=64)
+def _wanted_fingerprint(
+    video: Fingerprint,
+    *,
+    reference_frame: int,
+    moving_regions_px: tuple[tuple[tuple[float, float], ...], ...],
+    targets: tuple[Target, ...],
+    method: Method,
+) -> str:
+    """Return the engine's name for what is to be measured; the geometry, left out here, takes no part in it."""
+    setup = MeasureSetup(
+        video=file_of(video),
+        reference_frame=reference_frame,
+        moving_regions_px=moving_regions_px,
+        targets=targets,
+        method=method,
         lens=Lens.ideal((2, 2), 1.0),
         H_ray_plan=np.eye(3),
         origin_m=np.zeros(2),
