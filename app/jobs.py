@@ -60,18 +60,19 @@ class Job:
     started_s: float = field(default_factory=time.time)
     asked_to_stop: bool = False
     stopped_with_server: bool = False
-    _marks: deque[tuple[float, int]] = field(default_factory=deque)
-    _told_s: float = 0.0
+    # When how much was done, over the last few seconds: from this comes the rate.
+    _recent_progress: deque[tuple[float, int]] = field(default_factory=deque)
+    _tabs_told_s: float = 0.0
 
     def advance(self, stage: str, done: int, total: int) -> None:
         """Take note of progress; a new stage starts a new rate."""
         now = time.monotonic()
         if stage != self.stage or done < self.done:
-            self._marks.clear()
+            self._recent_progress.clear()
         self.stage, self.done, self.total = stage, done, total
-        self._marks.append((now, done))
-        while len(self._marks) > 2 and now - self._marks[0][0] > _RATE_WINDOW_S:
-            self._marks.popleft()
+        self._recent_progress.append((now, done))
+        while len(self._recent_progress) > 2 and now - self._recent_progress[0][0] > _RATE_WINDOW_S:
+            self._recent_progress.popleft()
 
     @property
     def is_running(self) -> bool:
@@ -81,9 +82,9 @@ class Job:
     @property
     def rate_per_s(self) -> float | None:
         """Units a second over the last few seconds."""
-        if len(self._marks) < 2:
+        if len(self._recent_progress) < 2:
             return None
-        (first_s, first), (last_s, last) = self._marks[0], self._marks[-1]
+        (first_s, first), (last_s, last) = self._recent_progress[0], self._recent_progress[-1]
         return (last - first) / (last_s - first_s) if last_s > first_s and last > first else None
 
     def as_json(self) -> dict[str, Any]:
@@ -107,9 +108,9 @@ class Job:
     def may_tell(self) -> bool:
         """Whether it is time to tell the tabs again; they need no more than a few pictures a second."""
         now = time.monotonic()
-        if now - self._told_s < 1.0 / _EVENTS_PER_S:
+        if now - self._tabs_told_s < 1.0 / _EVENTS_PER_S:
             return False
-        self._told_s = now
+        self._tabs_told_s = now
         return True
 
 
