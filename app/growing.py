@@ -11,7 +11,6 @@ import threading
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from app.answers import plain
 from app.errors import ApiError
 from app.jobs import Job
 from app.outcome import loaded, wanted_fingerprint
@@ -19,7 +18,7 @@ from app.store import ProjectFolder
 from core.errors import InputError
 from core.measurements import MeasurementStore
 from core.project import Drift, Intervals, Project
-from core.results import TargetHistory
+from core.results import TargetHistory, plain
 from core.run import FRAMES_FILE, LoadedInputs
 from core.solve import solve
 

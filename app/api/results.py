@@ -11,7 +11,7 @@ from fastapi import APIRouter
 from fastapi.responses import FileResponse, Response
 
 from app import outcome
-from app.answers import plain, points
+from app.answers import points
 from app.api.projects import Body
 from app.context import Context, Folder, Here
 from app.errors import ApiError, Missing, NotYet
@@ -21,7 +21,7 @@ from app.places import Places
 from app.store import CACHE_FOLDER, ProjectFolder
 from core.errors import InputError
 from core.project import Method, Project
-from core.results import TargetHistory
+from core.results import TargetHistory, plain
 from core.review import FrameOverlay, frame_overlay
 
 router = APIRouter(prefix="/api/projects/{project_id}")
