@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import io
+import lzma
 import os
 import shutil
 import stat
 import time
 import zipfile
+import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
 from app.errors import Invalid
-from app.history import HISTORY_FILE
+from app.history import DAMAGED_FILE, HISTORY_FILE
 from app.jobs import JOB_FILE
 from app.store import CACHE_FOLDER, RESULTS_FOLDER, ProjectFolder, Workspace, stored_inputs, with_inputs
 from app.uploads import SPARE_BYTES
@@ -27,6 +29,17 @@ _PACKED_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".laz", ".jpg", ".jpeg", ".p
 _MAX_FILES = 20_000
 _MAX_RATIO = 100
 _FREE_BYTES = 64 << 20
+# What reading a damaged zip raises, wherever the damage is: its directory, a header, or what was packed.
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zipfile.LargeZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    NotImplementedError,
+    EOFError,
+    OSError,
+    UnicodeError,
+)
 
 
 def archive_stream(project: ProjectFolder, *, inputs: bool) -> Iterator[bytes]:
@@ -65,7 +78,7 @@ def _inside_inputs(project: ProjectFolder, stored: Project) -> set[Path]:
 
 
 def _files(project: ProjectFolder, left_out: set[Path]) -> Iterator[Path]:
-    own = {PROJECT_FILE, HISTORY_FILE, f"{RESULTS_FOLDER}/{JOB_FILE}"}
+    own = {PROJECT_FILE, HISTORY_FILE, DAMAGED_FILE, f"{RESULTS_FOLDER}/{JOB_FILE}"}
     for folder, folders, names in os.walk(project.folder):
         folders[:] = sorted(name for name in folders if not name.startswith(".") and name != CACHE_FOLDER)
         for name in sorted(names):
@@ -132,7 +145,7 @@ def restore(workspace: Workspace, archive_file: Path, name: str | None) -> Proje
             project = project.model_copy(update={"name": name})
         write_project(folder, project)
         return workspace.adopt(folder, project.name)
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, EOFError, OSError, UnicodeError) as error:
+    except _DAMAGE as error:
         raise Invalid(f"The archive is damaged or no zip file ({error}); choose one made by Rooftrack.") from None
     except RuntimeError:
         raise Invalid("The archive is encrypted; unpack it and pack it again without a password.") from None
@@ -192,7 +205,7 @@ def _unpack(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> N
                 if left < 0:
                     raise Invalid(f"The archive lies about the size of {entry.filename!r}; it was not unpacked.")
                 stream.write(piece)
-        # By their times it is told whether results are older than inputs.
+        # A person tells by their times which of two files is the older one.
         packed_s = time.mktime((*entry.date_time, 0, 0, -1))
         os.utime(target, (packed_s, packed_s))
     except FileExistsError:

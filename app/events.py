@@ -27,7 +27,7 @@ class Hub:
         with self._lock:
             listeners = list(self._listeners.get(project_id, ()))
         for listener in listeners:
-            listener.put(_message(event, data))
+            listener.put(message(event, data))
 
     @contextmanager
     def listen(self, project_id: str) -> Iterator[_Listener]:
@@ -85,8 +85,6 @@ class _Listener:
             yield message
 
 
-def _message(event: str, data: Any) -> str:
+def message(event: str, data: Any) -> str:
+    """Return an event as it goes over the wire."""
     return f"event: {event}\ndata: {json.dumps(data, allow_nan=False)}\n\n"
-
-
-message = _message

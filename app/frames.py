@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from app.seeking import SeekingReader
 from core.errors import InputError
 from core.lens import Lens
-from core.storage import FarFile, File, FileState, file_at, state_of
+from core.storage import FarFile, File, FileState, content_identity, file_at, state_of
 
 Picture = NDArray[np.uint8]
 Fingerprint = tuple[str, int, int | str]
@@ -212,6 +212,23 @@ def _far_state(file: FarFile, moment: int) -> FileState:
 def file_of(key: Fingerprint) -> File:
     """Return the file a fingerprint was taken of."""
     return file_at(Path(), key[0])
+
+
+def identity(file: File) -> str:
+    """Return a name for a file's content; its bytes are looked at only where its size or time has changed.
+
+    Raises:
+        InputError: it is not there.
+    """
+    return _identity(fingerprint(file))
+
+
+@lru_cache(maxsize=256)
+def _identity(key: Fingerprint) -> str:
+    try:
+        return content_identity(file_of(key))
+    except OSError as error:
+        raise InputError(f"{key[0]}: cannot be read ({error.strerror}); choose it again in the inputs.") from None
 
 
 def scaled_to(picture: Picture, width: int | None) -> Picture:

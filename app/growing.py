@@ -11,15 +11,14 @@ import threading
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from app.answers import plain
 from app.errors import ApiError
-from app.jobs import ACTIVE, Job
+from app.jobs import Job
 from app.outcome import loaded, wanted_fingerprint
 from app.store import ProjectFolder
 from core.errors import InputError
 from core.measurements import MeasurementStore
 from core.project import Drift, Intervals, Project
-from core.results import TargetHistory
+from core.results import TargetHistory, plain
 from core.run import FRAMES_FILE, LoadedInputs
 from core.solve import solve
 
@@ -62,7 +61,7 @@ class Growing:
     def _follow(self, here: Context, folder: ProjectFolder, job: Job, growth: _Growth) -> None:
         wait = threading.Event()
         inputs: LoadedInputs | None = None
-        while job.state in ACTIVE:
+        while job.is_running:
             wait.wait(_PAUSE_S)
             try:
                 if inputs is None:

@@ -7,7 +7,7 @@ pages may load nothing but what this server has.
 
 from __future__ import annotations
 
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -56,12 +56,20 @@ class Guard:
 def same_origin(headers: Headers) -> bool:
     """Whether the request says it comes from a page of this very server."""
     origin = headers.get("origin")
-    return origin is not None and urlsplit(origin).netloc == headers.get("host")
+    return origin is not None and _parts(origin).netloc == headers.get("host")
 
 
 def host_name(host: str) -> str:
     """Return the name in a Host header, without its port."""
-    return urlsplit(f"//{host}").hostname or ""
+    return _parts(f"//{host}").hostname or ""
+
+
+def _parts(address: str) -> SplitResult:
+    """Return the parts of an address; all of them empty where it is none."""
+    try:
+        return urlsplit(address)
+    except ValueError:
+        return urlsplit("")
 
 
 def _refusal(scope: Scope, headers: Headers) -> Refused | None:

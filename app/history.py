@@ -6,14 +6,19 @@ file by hand, and that becomes a state of its own.
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from core.errors import InputError
+
 HISTORY_FILE = "history.sqlite"
+# What a history that SQLite cannot read is moved to.
+DAMAGED_FILE = "history.sqlite.damaged"
 # At 20 kB a state this is some 20 MB at most; an afternoon of clicking is a few hundred states.
 STATES_KEPT = 1000
 OUTSIDE_LABEL = "changed outside"
@@ -96,13 +101,42 @@ class History:
 
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
-        database = sqlite3.connect(self._file, timeout=10.0)
         try:
-            database.executescript(_SCHEMA)
-            with database:
+            with closing(self._connected()) as database, database:
                 yield database
-        finally:
-            database.close()
+        except sqlite3.Error as error:
+            if self._set_aside(error):
+                raise InputError(f"{self._file}: was damaged and has begun anew; load the page again.") from None
+            raise InputError(
+                f"{self._file}: cannot be used ({error}); see that it may be written and the disk has room."
+            ) from None
+
+    def _connected(self) -> sqlite3.Connection:
+        """Return the database, begun anew where the file is none: a project is more than its history."""
+        try:
+            return _connected(self._file)
+        except sqlite3.Error as error:
+            if not self._set_aside(error):
+                raise
+            return _connected(self._file)
+
+    def _set_aside(self, error: sqlite3.Error) -> bool:
+        """Move the file out of the way if the error says that it is damaged; return whether it does."""
+        # The lowest byte is the kind of error, what lies above only its details.
+        damaged = getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT)
+        if damaged:
+            os.replace(self._file, self._file.with_name(DAMAGED_FILE))
+        return damaged
+
+
+def _connected(file: Path) -> sqlite3.Connection:
+    database = sqlite3.connect(file, timeout=10.0)
+    try:
+        database.executescript(_SCHEMA)
+    except sqlite3.Error:
+        database.close()
+        raise
+    return database
 
 
 def _head(database: sqlite3.Connection) -> tuple[int, int]:

@@ -22,13 +22,12 @@ from typing import Any, Literal
 
 from app.errors import Busy, Missing
 from app.events import Hub
-from app.store import ProjectFolder, Workspace, read_json
+from app.store import ProjectFolder, read_json
 from core.errors import InputError
 from core.project import write_atomically
 
 JOB_FILE = "job.json"
-State = Literal["queued", "running", "done", "failed", "cancelled", "interrupted"]
-ACTIVE: tuple[State, ...] = ("queued", "running")
+State = Literal["running", "done", "failed", "cancelled", "interrupted"]
 # Reading a cloud for the eye disturbs nobody, so it may run beside one of the others.
 _BESIDE = "cloud"
 # What goes on by itself when the server comes back: nothing a person has to decide, and hours may have gone into it.
@@ -52,7 +51,7 @@ class Job:
     project: str
     kind: str
     parameters: dict[str, Any]
-    state: State = "queued"
+    state: State = "running"
     stage: str = ""
     done: int = 0
     total: int = 0
@@ -61,30 +60,36 @@ class Job:
     started_s: float = field(default_factory=time.time)
     asked_to_stop: bool = False
     stopped_with_server: bool = False
-    _marks: deque[tuple[float, int]] = field(default_factory=deque)
-    _told_s: float = 0.0
+    # When how much was done, over the last few seconds: from this comes the rate.
+    _recent_progress: deque[tuple[float, int]] = field(default_factory=deque)
+    _tabs_told_s: float = 0.0
 
     def advance(self, stage: str, done: int, total: int) -> None:
         """Take note of progress; a new stage starts a new rate."""
         now = time.monotonic()
         if stage != self.stage or done < self.done:
-            self._marks.clear()
+            self._recent_progress.clear()
         self.stage, self.done, self.total = stage, done, total
-        self._marks.append((now, done))
-        while len(self._marks) > 2 and now - self._marks[0][0] > _RATE_WINDOW_S:
-            self._marks.popleft()
+        self._recent_progress.append((now, done))
+        while len(self._recent_progress) > 2 and now - self._recent_progress[0][0] > _RATE_WINDOW_S:
+            self._recent_progress.popleft()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it has not ended yet."""
+        return self.state == "running"
 
     @property
     def rate_per_s(self) -> float | None:
         """Units a second over the last few seconds."""
-        if len(self._marks) < 2:
+        if len(self._recent_progress) < 2:
             return None
-        (first_s, first), (last_s, last) = self._marks[0], self._marks[-1]
+        (first_s, first), (last_s, last) = self._recent_progress[0], self._recent_progress[-1]
         return (last - first) / (last_s - first_s) if last_s > first_s and last > first else None
 
     def as_json(self) -> dict[str, Any]:
         """Return the job as the browser gets it."""
-        rate = self.rate_per_s if self.state == "running" else None
+        rate = self.rate_per_s if self.is_running else None
         return {
             "id": self.id,
             "project": self.project,
@@ -103,9 +108,9 @@ class Job:
     def may_tell(self) -> bool:
         """Whether it is time to tell the tabs again; they need no more than a few pictures a second."""
         now = time.monotonic()
-        if now - self._told_s < 1.0 / _EVENTS_PER_S:
+        if now - self._tabs_told_s < 1.0 / _EVENTS_PER_S:
             return False
-        self._told_s = now
+        self._tabs_told_s = now
         return True
 
 
@@ -126,6 +131,7 @@ class Jobs:
 
         Raises:
             Busy: another job of this project is running.
+            InputError: this computer cannot start one now.
         """
         with self._lock:
             running = self.running(project.id, kind)
@@ -135,21 +141,31 @@ class Jobs:
                     job=running.as_json(),
                 )
             job = Job(id=secrets.token_hex(8), project=project.id, kind=kind, parameters=parameters or {})
-            self._jobs[job.id] = job
+            try:
+                self._launch(project, job, finish)
+            except (OSError, RuntimeError) as error:
+                raise InputError(
+                    f"{_spoken(kind)} could not be started ({error}); make room on the disk and in memory, try again."
+                ) from None
             self._forget_oldest()
-            process = _spawn()
-            self._processes[job.id] = process
-            job.state = "running"
-            self._note(project, job)
-            order = {"kind": kind, "folder": str(project.folder), "parameters": job.parameters}
-            _send(process, json.dumps(order))
-            watcher = threading.Thread(
-                target=self._watch, args=(project, job, process, finish), name=f"job {kind}", daemon=True
-            )
-            self._watchers[job.id] = watcher
-            watcher.start()
         self._tell(job)
         return job
+
+    def _launch(self, project: ProjectFolder, job: Job, finish: Finish | None) -> None:
+        """Start a job's worker and its watcher; a job that cannot have both leaves nothing behind."""
+        process = _spawn()
+        try:
+            self._note(project, job)
+            order = {"kind": job.kind, "folder": str(project.folder), "parameters": job.parameters}
+            _send(process, json.dumps(order))
+            args = (project, job, process, finish)
+            watcher = threading.Thread(target=self._watch, args=args, name=f"job {job.kind}", daemon=True)
+            watcher.start()
+        except BaseException:
+            process.kill()
+            process.communicate()
+            raise
+        self._jobs[job.id], self._processes[job.id], self._watchers[job.id] = job, process, watcher
 
     def get(self, job_id: str) -> Job:
         """Return a job.
@@ -166,7 +182,7 @@ class Jobs:
         """Return the running job of a project that a job of this kind would have to wait for."""
         for job in list(self._jobs.values()):
             beside = (job.kind == _BESIDE) != (kind == _BESIDE)
-            if job.project == project_id and job.state in ACTIVE and not beside:
+            if job.project == project_id and job.is_running and not beside:
                 return job
         return None
 
@@ -178,7 +194,7 @@ class Jobs:
     def cancel(self, job: Job) -> None:
         """Ask a job to stop; the answer comes when it has."""
         process = self._processes.get(job.id)
-        if job.state in ACTIVE and process is not None and not job.asked_to_stop:
+        if job.is_running and process is not None and not job.asked_to_stop:
             job.asked_to_stop = True
             job.message = "Stopping after the frame it is in."
             _send(process, "cancel")
@@ -189,13 +205,13 @@ class Jobs:
 
     def cancel_all(self, project_id: str) -> None:
         """Stop every job of a project and wait until none of them writes any more."""
-        for job in [job for job in list(self._jobs.values()) if job.project == project_id and job.state in ACTIVE]:
+        for job in [job for job in list(self._jobs.values()) if job.project == project_id and job.is_running]:
             self.cancel(job)
             self._await_end(job)
 
     def close(self) -> None:
         """Stop every job because the server stops; tracking will go on when it is back."""
-        active = [job for job in list(self._jobs.values()) if job.state in ACTIVE]
+        active = [job for job in list(self._jobs.values()) if job.is_running]
         for job in active:
             process = self._processes.get(job.id)
             if job.kind == _BESIDE and process is not None:
@@ -205,19 +221,15 @@ class Jobs:
         for job in active:
             self._await_end(job)
 
-    def go_on(self, workspace: Workspace, finishes: dict[str, Finish]) -> list[tuple[ProjectFolder, Job]]:
-        """Go on with the tracking that ran when the last server of this workspace stopped; return what was started."""
-        started = []
-        for project in workspace.projects():
-            note = read_json(project.results / JOB_FILE)
-            if not isinstance(note, dict) or note.get("state") not in ("running", "interrupted"):
-                continue
-            if note.get("kind") == _RESUMED:
-                parameters = {**(note.get("parameters") or {}), "fresh": False}
-                started.append((project, self.start(project, _RESUMED, parameters, finishes.get(_RESUMED))))
-            else:
-                (project.results / JOB_FILE).unlink(missing_ok=True)
-        return started
+    def go_on(self, project: ProjectFolder, finish: Finish) -> Job | None:
+        """Go on with the tracking of a project that ran when the last server stopped; None where none did."""
+        note = read_json(project.results / JOB_FILE)
+        if not isinstance(note, dict) or note.get("state") not in ("running", "interrupted"):
+            return None
+        if note.get("kind") != _RESUMED:
+            (project.results / JOB_FILE).unlink(missing_ok=True)
+            return None
+        return self.start(project, _RESUMED, {**(note.get("parameters") or {}), "fresh": False}, finish)
 
     def _await_end(self, job: Job) -> None:
         watcher = self._watchers.get(job.id)
@@ -272,7 +284,10 @@ class Jobs:
             state, message = "failed", str(error)
         with self._lock:
             job.message, job.state = message, state
-            self._note(project, job)
+            try:
+                self._note(project, job)
+            except OSError as error:  # the tabs have to hear all the more that it is over
+                log.error("the end of job %s of %s could not be noted: %s", job.kind, job.project, error)
             self._processes.pop(job.id, None)
             self._watchers.pop(job.id, None)
         self._tell(job)
@@ -290,7 +305,7 @@ class Jobs:
         self._hub.publish(job.project, "job", job.as_json())
 
     def _forget_oldest(self) -> None:
-        over = [job.id for job in self._jobs.values() if job.state not in ACTIVE][: len(self._jobs) - _JOBS_KEPT]
+        over = [job.id for job in self._jobs.values() if not job.is_running][: len(self._jobs) - _JOBS_KEPT]
         for job_id in over if len(self._jobs) > _JOBS_KEPT else ():
             del self._jobs[job_id]
 

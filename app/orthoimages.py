@@ -8,13 +8,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from app.frames import Fingerprint, Picture, fingerprint, png_of, scaled_to
+from app.frames import Fingerprint, Picture, fingerprint, identity, png_of, scaled_to
 from app.sites import read_site
 from app.store import CACHE_FOLDER, ProjectFolder, read_json
 from core.coordinates import OrthoGrid
 from core.errors import InputError
 from core.orthoimage import make_orthoimage, read_geotiff, read_grid, write_geotiff
-from core.prediction import video_identity
 from core.progress import CancelToken, Progress
 from core.project import Orthoimage as Settings
 from core.project import Project, read_project, write_atomically
@@ -70,17 +69,12 @@ def _is_stale(folder: ProjectFolder, project: Project, grid: OrthoGrid) -> bool:
         made_from = (folder.results / _MADE_FROM).read_text(encoding="utf-8")
     except OSError:
         return True
-    return made_from != _origin(_identity(fingerprint(cloud)), settings)
+    return made_from != _origin(identity(cloud), settings)
 
 
 def _origin(cloud: str, settings: Settings) -> str:
     """Return what an orthoimage is made from, as a run of the engine notes it down too."""
     return f"{cloud} {settings.model_dump_json()}"
-
-
-@lru_cache(maxsize=32)
-def _identity(key: Fingerprint) -> str:
-    return video_identity(Path(key[0]))
 
 
 @lru_cache(maxsize=2)
@@ -125,7 +119,7 @@ def build(folder: Path, order: dict[str, Any], progress: Progress, cancel: Cance
     cancel.raise_if_cancelled()
     file = folder / "results" / ORTHOIMAGE_FILE
     write_geotiff(file, ortho)
-    made_from = _origin(video_identity(Path(order["cloud"])), project.orthoimage)
+    made_from = _origin(identity(Path(order["cloud"])), project.orthoimage)
     write_atomically(file.with_name(_MADE_FROM), made_from.encode())
     note = {
         "made": list(fingerprint(file)[1:]),

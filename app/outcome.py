@@ -9,7 +9,7 @@ from __future__ import annotations
 import sqlite3
 import threading
 from collections import OrderedDict
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from app.errors import ApiError, NotYet
-from app.frames import Fingerprint, file_of, fingerprint
+from app.frames import Fingerprint, file_of, fingerprint, identity
 from app.jobs import JOB_FILE
 from app.store import ProjectFolder, read_json, stored_inputs
 from app.videos import video_info
@@ -26,12 +26,12 @@ from core.export import SUMMARY_FILE, GpsCheck, Results, compared_with_gps
 from core.lens import Lens
 from core.measurements import FrameMeasurement, MeasurementStore, Recording
 from core.prediction import MeasureSetup
-from core.project import Drift, Method, Project, project_json
+from core.project import Drift, Method, Project, Target, project_json
 from core.results import TargetHistory, read_history_csv
 from core.run import FRAMES_FILE, LoadedInputs, load_inputs, program_version, relief_plan
 from core.solution import Solution
 from core.solve import solve
-from core.storage import File, file_at
+from core.storage import File
 from core.video import frame_index
 
 METHODS: tuple[Method, ...] = ("geometric", "paper")
@@ -111,15 +111,16 @@ def _is_stale(folder: ProjectFolder, project: Project, summary: dict[str, Any]) 
     then = summary.get("settings")
     if not isinstance(then, dict) or {**then, "name": ""} != {**now, "name": ""}:
         return True
-    made_s = (folder.results / SUMMARY_FILE).stat().st_mtime
-    for file in stored_inputs(project.inputs).values():
-        try:
-            near = None if file is None else file_at(folder.folder, file)
-            if isinstance(near, Path) and near.stat().st_mtime > made_s:
-                return True
-        except OSError:
-            return True
-    return False
+    return summary.get("identity") != _identities(folder, project)
+
+
+def _identities(folder: ProjectFolder, project: Project) -> dict[str, str] | None:
+    """Return a name for the content of each input, by its path as the project names it; None where one is not there."""
+    try:
+        files = {stored: folder.input_file(kind, project) for kind, stored in stored_inputs(project.inputs).items()}
+        return {stored: identity(file) for stored, file in files.items() if stored is not None and file is not None}
+    except (InputError, ApiError):
+        return None
 
 
 def _frames_total(folder: ProjectFolder, project: Project, exactly: bool) -> int:
@@ -158,33 +159,31 @@ def wanted_fingerprint(video: File, project: Project) -> str:
 
 
 def _wanted(video: Fingerprint, project: Project) -> str:
-    decided = project.model_dump_json(include={"reference_frame", "moving_regions_px", "targets", "method"})
-    return _wanted_fingerprint(video, decided, _Hidden(project))
-
-
-class _Hidden:
-    """A project that takes no part in a cache's key, because another argument says what matters of it."""
-
-    def __init__(self, project: Project) -> None:
-        self.project = project
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Hidden)
-
-    def __hash__(self) -> int:
-        return 0
-
-
-@lru_cache(maxsize=64)
-def _wanted_fingerprint(video: Fingerprint, decided: str, hidden: _Hidden) -> str:
-    """Return the engine's name for what is to be measured; the geometry, left out here, takes no part in it."""
-    project = hidden.project
-    setup = MeasureSetup(
-        video=file_of(video),
+    return _wanted_fingerprint(
+        video,
         reference_frame=project.reference_frame,
         moving_regions_px=project.moving_regions_px,
         targets=project.targets,
         method=project.method,
+    )
+
+
+@lru_cache(maxsize=64)
+def _wanted_fingerprint(
+    video: Fingerprint,
+    *,
+    reference_frame: int,
+    moving_regions_px: tuple[tuple[tuple[float, float], ...], ...],
+    targets: tuple[Target, ...],
+    method: Method,
+) -> str:
+    """Return the engine's name for what is to be measured; the geometry, left out here, takes no part in it."""
+    setup = MeasureSetup(
+        video=file_of(video),
+        reference_frame=reference_frame,
+        moving_regions_px=moving_regions_px,
+        targets=targets,
+        method=method,
         lens=Lens.ideal((2, 2), 1.0),
         H_ray_plan=np.eye(3),
         origin_m=np.zeros(2),
@@ -281,8 +280,7 @@ class Outcomes:
 
 
 def _solve(folder: ProjectFolder, project: Project, method: Method) -> Solved:
-    inputs = loaded(folder, project)
-    inputs = replace(inputs, project=by_method(project, method))
+    inputs = loaded(folder, by_method(project, method))
     wanted = _wanted(fingerprint(folder.require_video(project)), inputs.project)
     with MeasurementStore(folder.results / FRAMES_FILE) as store:
         number = store.find(method, wanted)
@@ -311,7 +309,7 @@ def loaded(folder: ProjectFolder, project: Project) -> LoadedInputs:
     plan = relief_plan(folder.folder, project)
     if plan is not None and not plan.file.is_file():
         raise NotYet("The ground is being taken from the cloud; it takes a moment.", path="inputs.cloud")
-    return load_inputs(folder.folder)
+    return load_inputs(folder.folder, project=project)
 
 
 @lru_cache(maxsize=8)
@@ -336,6 +334,7 @@ def _results_of(folder: ProjectFolder, project: Project, found: Solved) -> Resul
         gps=found.inputs.gps,
         video=found.inputs.video,
         sha256={},
+        identity={},
         version=program_version(),
         frames_measured=0,
         measuring_s=0.0,

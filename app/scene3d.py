@@ -2,7 +2,7 @@
 
 viser 1.1 answers anybody who reaches its port, takes another server's address from a link, and opens a tunnel to the
 internet when a client asks. So it listens on loopback at a port nobody is told, answers only who holds this process's
-token, has its tunnel handlers taken out, and is reached through `app.api.scene` alone, which checks where a request
+token, has its tunnel handlers taken out, and is reached through `app.api.viser` alone, which checks where a request
 comes from.
 
 The scene shows one project at a time, relative to a local origin, since a browser draws in single precision.
@@ -16,6 +16,7 @@ import secrets
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,8 @@ from core.coordinates import Floats, OrthoGrid
 TOKEN_HEADER = "X-Viser-Token"
 CLIENT_FILE = Path(viser.__file__).parent / "client" / "build" / "index.html"
 MAX_POINTS = 5_000_000
-# Blue, orange, green of Okabe and Ito: told apart by colour-blind people too.
-LINE_COLOURS = {"L1": (0, 114, 178), "L2": (230, 159, 0), "T1": (0, 158, 115)}
-_GROUND_COLOUR, _PATH_COLOUR, _FRUSTUM_COLOUR = (86, 180, 233), (204, 121, 167), (240, 228, 66)
+# Green, blue and yellow of Okabe and Ito, which no roof line has; the ground is green in the report too.
+_GROUND_COLOUR, _PATH_COLOUR, _FRUSTUM_COLOUR = (0, 158, 115), (0, 114, 178), (240, 228, 66)
 _REST_COLOUR = (150, 150, 150)
 
 Pick = Callable[[Floats, Floats], None]
@@ -87,6 +87,20 @@ class _Shown:
     keys: dict[str, Any] = field(default_factory=dict)
     nodes: dict[str, list[Any]] = field(default_factory=dict)
     visible: dict[str, bool] = field(default_factory=dict)
+
+
+@cache
+def line_colours() -> dict[str, tuple[int, int, int]]:
+    """Return the colours of L1, L2 and T1 as red, green, blue: those of the report."""
+    from core import figures  # takes a moment to import, which a server that shows no scene should not wait for
+
+    return {name: _rgb(colour) for name, colour in figures.LINE_COLOURS.items()}
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    """Return red, green and blue of a colour such as `#56B4E9`."""
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
+    return red, green, blue
 
 
 class Scene3D:
@@ -238,7 +252,7 @@ class Scene3D:
         """Show roof lines, named `target/L1`: (2, 3) ends each, world; and, thin, where they are at rest."""
         with self._replacing("lines", key) as (scene, add):
             for name, ends in lines_m.items():
-                colour = LINE_COLOURS.get(name.rpartition("/")[2], (230, 230, 230))
+                colour = line_colours().get(name.rpartition("/")[2], (230, 230, 230))
                 segment = (ends - self.origin_m).astype(np.float32)[None]
                 add(scene.add_line_segments(f"/lines/moved/{name}", segment, colour, **_thick(5.0)))
             for name, ends in rest_m.items():

@@ -22,7 +22,7 @@ from starlette.types import Scope
 
 from app.api import drift, events, frames, geometry, inputs, orthoimage, projects, results, scene, viser
 from app.context import Context, Here
-from app.errors import Missing, install_error_handlers
+from app.errors import ApiError, Missing, install_error_handlers
 from app.events import Hub
 from app.frames import FrameStore
 from app.growing import Growing
@@ -33,7 +33,7 @@ from app.places import Places
 from app.scene3d import Scene3D
 from app.sites import Sites
 from app.steps import STEPS, steps_of
-from app.store import Workspace
+from app.store import ProjectFolder, Workspace
 from core.errors import InputError
 from core.locks import take_lock
 
@@ -83,9 +83,9 @@ def create_app(workspace: Path, roots: Sequence[Path] = ()) -> FastAPI:
 async def _life(app: FastAPI) -> AsyncIterator[None]:
     context: Context = app.state.context
     charge = take_lock(context.workspace.folder)
-    if charge is not None:
-        await run_in_threadpool(_tidy_and_go_on, context)
     try:
+        if charge is not None:
+            await run_in_threadpool(_tidy_and_go_on, context)
         yield
     finally:
         context.hub.close()
@@ -98,9 +98,17 @@ def _tidy_and_go_on(context: Context) -> None:
     for part in context.workspace.folder.glob(".incoming-*"):
         part.unlink(missing_ok=True)
     context.workspace.empty_trash()
-    for folder in context.workspace.projects():
-        folder.remove_parts()
-    for folder, job in context.jobs.go_on(context.workspace, {"track": results.finish_track(context)}):
+    for project_id in context.workspace.ids():
+        try:
+            _tidy_project(context, context.workspace.open(project_id))
+        except (ApiError, InputError, OSError) as error:
+            log.warning("%s was left as it is: %s", project_id, error)
+
+
+def _tidy_project(context: Context, folder: ProjectFolder) -> None:
+    folder.remove_parts()
+    job = context.jobs.go_on(folder, results.finish_track(context))
+    if job is not None:
         context.growing.follow(context, folder, job)
 
 

@@ -45,13 +45,14 @@ class Sites:
         self._jobs = jobs
         self._sites: OrderedDict[str, Site] = OrderedDict()
         self._reliefs: dict[str, Relief | None] = {}
+        self._forgotten: set[str] = set()
         self._lock = threading.Lock()
 
     def facts(self, folder: ProjectFolder, project: Project, path: Path) -> dict[str, Any] | None:
         """Return what is known of a project's cloud; None while a job reads it, which this starts.
 
         Raises:
-            InputError: the cloud was read and cannot be used.
+            InputError: the cloud was read and cannot be used, or reading it broke off.
         """
         key = site_key(path, project)
         facts = _known(folder, key)
@@ -110,18 +111,29 @@ class Sites:
             if path is not None and known and plan is not None and not plan.file.is_file():
                 self._read(folder, project, path, site_key(path, project))
 
+    def forget_failure(self, folder: ProjectFolder) -> None:
+        """Let a reading of the cloud that broke off begin anew."""
+        latest = self._jobs.latest(folder.id, "cloud")
+        if latest is not None:
+            self._forgotten.add(latest.id)
+
     def _read(self, folder: ProjectFolder, project: Project, path: Path, key: str) -> None:
-        if self._jobs.running(folder.id, "cloud") is None:
-            plan = relief_plan(folder.folder, project)
-            order = {
-                "cloud": str(path),
-                "key": key,
-                "ground_z_m": project.orthoimage.ground_z_m,
-                "relief": plan.file.name if plan else None,
-            }
-            latest = self._jobs.latest(folder.id, "cloud")
-            if latest is None or latest.state != "failed" or latest.parameters != order:
-                self._jobs.start(folder, "cloud", order)
+        if self._jobs.running(folder.id, "cloud") is not None:
+            return
+        plan = relief_plan(folder.folder, project)
+        order = {
+            "cloud": str(path),
+            "key": key,
+            "ground_z_m": project.orthoimage.ground_z_m,
+            "relief": plan.file.name if plan else None,
+        }
+        latest = self._jobs.latest(folder.id, "cloud")
+        failed = latest is not None and latest.state == "failed" and latest.parameters == order
+        if latest is not None and failed and latest.id not in self._forgotten:
+            raise InputError(
+                f"{path.name}: {latest.message} It is read anew when the page of the inputs is loaded again."
+            )
+        self._jobs.start(folder, "cloud", order)
 
 
 def site_key(path: Path, project: Project) -> str:

@@ -29,7 +29,7 @@ from core.project import (
     project_problems,
     write_project,
 )
-from core.storage import File, file_at
+from core.storage import FarFile, File, file_at
 
 _AnyFile = TypeVar("_AnyFile", bound=File)
 
@@ -69,11 +69,6 @@ class ProjectFolder:
         """Folder of everything that can be computed again."""
         return self.folder / RESULTS_FOLDER
 
-    @property
-    def updated_s(self) -> float:
-        """When the project was last edited, seconds since the epoch."""
-        return (self.folder / PROJECT_FILE).stat().st_mtime
-
     def load(self) -> Saved:
         """Return the project and its revision.
 
@@ -100,7 +95,7 @@ class ProjectFolder:
         with self._lock:
             saved = self.load()
             inputs = saved.project.inputs.model_dump()
-            stored = None if file is None else self._relative(file)
+            stored = None if file is None else self._named(self._places.allowed(os.path.abspath(file)))
             if kind == "gps" and stored is not None:
                 inputs["gps"] = {**(inputs["gps"] or {}), "file": stored}
             else:
@@ -141,14 +136,7 @@ class ProjectFolder:
             Refused: outside the allowed folders.
         """
         stored = stored_inputs((project or self.load().project).inputs)[kind]
-        if stored is None:
-            return None
-        file = file_at(self.folder, stored) if kind == "video" else self.folder / stored
-        if isinstance(file, Path):
-            return self._places.allowed(os.path.abspath(file))
-        if file.is_near:
-            raise Refused(f"{file}: is a file of this computer; name it by its path.", path=f"inputs.{kind}")
-        return file
+        return None if stored is None else self._file_of(kind, stored)
 
     def input_path(self, kind: str, project: Project | None = None) -> Path | None:
         """Return where an input lies on this computer, or None where none is given there.
@@ -184,16 +172,29 @@ class ProjectFolder:
         file = self.input_file(kind, project)
         return file.is_file() if isinstance(file, Path) else file is not None
 
-    def free_name(self, wanted: str) -> str:
-        """Return a file name for the project folder, as wanted but free of what could do harm.
+    def take_in(self, kind: str, part: Path, wanted: str) -> Saved:
+        """Make what was received an input, under the name it came with or the next free one.
 
-        Raises:
-            Invalid: nothing usable is left of it, or the project itself uses the name.
+        What this very input was may be replaced; a file of another input, or one that is no input, never is.
         """
-        name = re.sub(r"[^\w .()+-]", "_", Path(wanted.replace("\\", "/")).name).strip(" .")[-120:]
-        if not name or name.lower() in _RESERVED or name.startswith("."):
-            raise Invalid(f"{wanted!r} cannot be the name of an input; rename the file.", path="filename")
-        return name
+        with self._lock:
+            name = self._free_name(wanted, kind)
+            os.replace(part, self.folder / name)
+            return self.change_input(kind, self.folder / name, label=f"take in {kind} {name}")
+
+    def _free_name(self, wanted: str, kind: str) -> str:
+        name = plain_name(wanted)
+        number, candidate = 1, Path(name)
+        while self._is_taken(candidate.name, kind):
+            number += 1
+            candidate = candidate.with_name(f"{Path(name).stem}-{number}{candidate.suffix}")
+        return candidate.name
+
+    def _is_taken(self, name: str, kind: str) -> bool:
+        """Whether a file of the project folder is anything but this kind of input."""
+        named = stored_inputs(self._read().inputs)
+        kinds = {other for other, file in named.items() if file and os.path.normpath(file) == name}
+        return bool(kinds - {kind}) or (not kinds and os.path.lexists(self.folder / name))
 
     def part_file(self) -> Path:
         """Return a place for something that is still coming in."""
@@ -230,20 +231,46 @@ class ProjectFolder:
         project = Project.model_validate(document)
         before = stored_inputs(self._read().inputs)
         changed = {kind: file for kind, file in stored_inputs(project.inputs).items() if file != before[kind]}
-        relative = {kind: self._relative(self.folder / file) for kind, file in changed.items() if file is not None}
-        return project.model_copy(update={"inputs": with_inputs(project.inputs, relative)})
+        named = {kind: self._named(self._file_of(kind, file)) for kind, file in changed.items() if file is not None}
+        return project.model_copy(update={"inputs": with_inputs(project.inputs, named)})
 
-    def _relative(self, file: Path) -> str:
-        """How an input is written into the project: from its folder, so that both may be moved together."""
-        real = self._places.allowed(os.path.abspath(file))
+    def _file_of(self, kind: str, stored: str) -> File:
+        """Return where an input that is written into the project so lies.
+
+        Raises:
+            Refused: outside the allowed folders.
+        """
+        file = file_at(self.folder, stored) if kind == "video" else self.folder / stored
+        if isinstance(file, Path):
+            return self._places.allowed(os.path.abspath(file))
+        if file.is_near:
+            raise Refused(f"{file}: is a file of this computer; name it by its path.", path=f"inputs.{kind}")
+        return file
+
+    def _named(self, file: File) -> str:
+        """How an input is written into the project: by its address, or from the folder, so that both may be moved."""
+        if isinstance(file, FarFile):
+            return file.address
         try:
-            return Path(os.path.relpath(real, self.folder)).as_posix()
+            return Path(os.path.relpath(file, self.folder)).as_posix()
         except ValueError:  # another drive on Windows
-            return real.as_posix()
+            return file.as_posix()
 
     def _store(self, project: Project, *, label: str, merge: bool = False) -> Saved:
         write_project(self.folder, project)
         return Saved(project, self._history.record(label, project_json(project), merge=merge))
+
+
+def plain_name(wanted: str) -> str:
+    """Return a file name for the project folder, as wanted but free of what could do harm.
+
+    Raises:
+        Invalid: nothing usable is left of it, or the project itself uses the name.
+    """
+    name = re.sub(r"[^\w .()+-]", "_", Path(wanted.replace("\\", "/")).name).strip(" .")[-120:]
+    if not name or name.lower() in _RESERVED or name.startswith("."):
+        raise Invalid(f"{wanted!r} cannot be the name of an input; rename the file.", path="filename")
+    return name
 
 
 def stored_inputs(inputs: Inputs) -> dict[str, str | None]:
@@ -282,10 +309,14 @@ class Workspace:
         self._open: dict[str, ProjectFolder] = {}
         self._lock = threading.Lock()
 
-    def projects(self) -> Iterator[ProjectFolder]:
-        """Yield the projects, the last edited first."""
+    def ids(self) -> list[str]:
+        """Return the ids of all projects, the last edited first; `open` may refuse one that is a link to elsewhere."""
         found = [path.name for path in self.folder.iterdir() if _ID.fullmatch(path.name) and _is_project(path)]
-        yield from sorted((self.open(name) for name in found), key=lambda project: -project.updated_s)
+        return sorted(found, key=lambda name: -self.updated_s(name))
+
+    def updated_s(self, project_id: str) -> float:
+        """Return when a project was last edited, seconds since the epoch."""
+        return 1e-9 * _modified_ns(self.folder / project_id / PROJECT_FILE)
 
     def open(self, project_id: str) -> ProjectFolder:
         """Return a project by its id, the name of its folder.

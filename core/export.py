@@ -74,6 +74,7 @@ class Results:
         gps: to compare with, where given.
         video: its file.
         sha256: of each input, by its path as the project names it.
+        identity: of each input, by which it is told without reading all of it whether it is still the same.
         version: of the program.
         frames_measured: in this run; the others were known from earlier ones.
         measuring_s, solving_s: how long both took.
@@ -86,6 +87,7 @@ class Results:
     gps: GpsRecord | None
     video: File
     sha256: Mapping[str, str]
+    identity: Mapping[str, str]
     version: str
     frames_measured: int
     measuring_s: float
@@ -225,6 +227,7 @@ def summary_of(results: Results, check: GpsCheck | None, warnings: list[str]) ->
         "flight": _flight_summary(solution.flight),
         "rolling_shutter": None if solution.readout is None else dataclasses.asdict(solution.readout),
         "sha256": dict(results.sha256),
+        "identity": dict(results.identity),
         "settings": results.project.model_dump(mode="json"),
     }
 

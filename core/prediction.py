@@ -16,14 +16,12 @@ from core.following import Apparent
 from core.lens import Lens
 from core.measurements import FrameMeasurement, Reference
 from core.project import Method, Target
-from core.storage import File, opened, state_of
+from core.storage import File, content_identity
 
 # Raised whenever the same video would be measured differently: older recordings are then not continued.
 MEASURE_VERSION = 5
 # Over a longer gap nothing goes on as it was, and the last place is as good a guess as any.
 MOST_STEPS = 2.0
-# Bytes read at each of a video's places to tell it from another.
-SAMPLE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -56,22 +54,15 @@ class MeasureSetup:
         ]
         decided = [MEASURE_VERSION, self.method, self.reference_frame, self.moving_regions_px, looked_for]
         digest = hashlib.sha256(json.dumps(decided, sort_keys=True).encode())
-        digest.update(video_identity(self.video).encode())
+        digest.update(_video_identity(self.video).encode())
         return digest.hexdigest()
 
 
-def video_identity(video: File) -> str:
-    """Return a name for a video's content from its size and samples of its bytes; quick for any size."""
+def _video_identity(video: File) -> str:
     try:
-        size = state_of(video).size
-        digest = hashlib.sha256(str(size).encode())
-        with opened(video) as stream:
-            for place in sorted({0, max(0, size // 2), max(0, size - SAMPLE_BYTES)}):
-                stream.seek(place)
-                digest.update(stream.read(SAMPLE_BYTES))
+        return content_identity(video)
     except OSError:
         raise InputError(f"{video}: not found; correct inputs.video or put the file there.") from None
-    return digest.hexdigest()
 
 
 def nothing_measured(reference: Reference, frame: int, time_s: float) -> FrameMeasurement:

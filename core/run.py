@@ -26,12 +26,12 @@ from core.locks import take_lock
 from core.measure import measure
 from core.measurements import MeasurementStore
 from core.orthoimage import make_orthoimage, write_geotiff
-from core.prediction import MeasureSetup, video_identity
+from core.prediction import MeasureSetup
 from core.progress import CancelToken, Progress, silent
 from core.project import PROJECT_FILE, Project, read_project, write_atomically
 from core.relief import Relief, rasterise
 from core.solve import solve
-from core.storage import File, file_at, opened, state_of
+from core.storage import File, content_identity, file_at, opened, state_of
 from core.validation import GpsRecord, read_gps
 from core.video import VideoInfo, frame_index, probe
 
@@ -143,6 +143,7 @@ def run_project(
             gps=inputs.gps,
             video=inputs.video,
             sha256={file: sha256_of(file_at(folder, file), results) for file in input_files(inputs.project)},
+            identity={file: content_identity(file_at(folder, file)) for file in input_files(inputs.project)},
             version=program_version(),
             frames_measured=new,
             measuring_s=measured_s,
@@ -168,13 +169,16 @@ def _only_writer(results: Path) -> Iterator[None]:
         yield
 
 
-def load_inputs(folder: Path, progress: Progress = silent) -> LoadedInputs:
+def load_inputs(folder: Path, progress: Progress = silent, *, project: Project | None = None) -> LoadedInputs:
     """Open everything a project names.
+
+    Args:
+        project: in that folder, as `project.json` has it where None.
 
     Raises:
         InputError: something is missing, malformed or does not fit together.
     """
-    project = read_project(folder)
+    project = project or read_project(folder)
     video = file_at(folder, project.inputs.video)
     info = probe(video)
     lens = _lens_of(folder, project, video, info)
@@ -238,10 +242,17 @@ def relief_plan(folder: Path, project: Project) -> ReliefPlan | None:
     below = _middle_of_targets(project, places)
     extent = (float(west), float(south), float(east), float(north))
     decided = json.dumps(
-        [RELIEF_VERSION, video_identity(cloud_file), extent, below.tolist(), project.orthoimage.ground_z_m]
+        [RELIEF_VERSION, _cloud_identity(cloud_file), extent, below.tolist(), project.orthoimage.ground_z_m]
     )
     name = hashlib.sha256(decided.encode()).hexdigest()[:16]
     return ReliefPlan(extent, below, folder / "results" / f"{name}-{RELIEF_FILE}")
+
+
+def _cloud_identity(cloud_file: Path) -> str:
+    try:
+        return content_identity(cloud_file)
+    except OSError:
+        raise InputError(f"{cloud_file}: not found; correct inputs.cloud or put the file there.") from None
 
 
 def _relief_of(folder: Path, project: Project, progress: Progress) -> Relief | None:
@@ -300,7 +311,7 @@ def _write_orthoimage(inputs: LoadedInputs, progress: Progress) -> None:
     file = inputs.folder / "results" / ORTHOIMAGE_FILE
     note = file.with_suffix(".made-from")
     settings = inputs.project.orthoimage.model_dump_json()
-    made_from = f"{video_identity(inputs.folder / inputs.project.inputs.cloud)} {settings}"
+    made_from = f"{_cloud_identity(inputs.folder / inputs.project.inputs.cloud)} {settings}"
     if file.exists() and note.exists() and note.read_text() == made_from:
         return
     cloud, plane = read_ground(inputs.folder, inputs.project, progress)

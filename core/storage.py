@@ -7,6 +7,7 @@ project.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from core.errors import InputError
 
 # Read at once from far away: about half a second of 4K video, so that waiting for an answer weighs little.
 BLOCK_BYTES = 4 << 20
+# Bytes read at each of a file's places to tell it from another.
+SAMPLE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,22 @@ def opened(file: File) -> Iterator[BinaryIO]:
         far = storage.open(path, "rb", block_size=BLOCK_BYTES)
     with far:
         yield far
+
+
+def content_identity(file: File) -> str:
+    """Return a name for a file's content from its size and samples of its bytes; quick for any size.
+
+    Raises:
+        OSError: a file on this machine is not there or cannot be read.
+        InputError: one that lies far away cannot be reached.
+    """
+    size = state_of(file).size
+    digest = hashlib.sha256(str(size).encode())
+    with opened(file) as stream:
+        for place in sorted({0, max(0, size // 2), max(0, size - SAMPLE_BYTES)}):
+            stream.seek(place)
+            digest.update(stream.read(SAMPLE_BYTES))
+    return digest.hexdigest()
 
 
 def _storage_of(file: FarFile) -> tuple[Any, str]:

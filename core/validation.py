@@ -30,6 +30,8 @@ _LEAST_CORRELATION = 0.5
 _RIVAL = 1.2
 # A GPS time is compared where the video was measured on both sides, not farther apart than this many frames.
 _BRIDGED_FRAMES = 3.5
+# Samples a record may lack: about six days at 10 Hz. Laid out evenly they take a gigabyte when they are correlated.
+_MOST_MISSING = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,26 @@ def read_gps(path: Path, settings: GpsInput) -> GpsRecord:
             f'{path}: line {line}: "{columns["time"]}" is {table[backwards[0] + 1, 0]:g}, not after the line before '
             f"({table[backwards[0], 0]:g}); sort the record and remove what is double."
         )
+    _require_one_stretch(path, table[:, 0], lines)
     return GpsRecord(path.name, read_only(table[:, 0]), read_only(table[:, 1:]))
+
+
+def _require_one_stretch(path: Path, time_s: Floats, lines: list[tuple[int, str]]) -> None:
+    """Refuse times that jump so far that no even grid over them fits into memory, as from 0 to Unix seconds.
+
+    Args:
+        lines: of the file, the header first.
+    """
+    steps_s = np.diff(time_s)
+    usual_s = float(np.median(steps_s))
+    if (time_s[-1] - time_s[0]) / usual_s - len(steps_s) <= _MOST_MISSING:
+        return
+    widest = int(np.argmax(steps_s))
+    raise InputError(
+        f"{path}: line {lines[widest + 2][0]}: its time is {steps_s[widest]:g} s after that of the line before, "
+        f"{time_s[widest]:g} s, while most are {usual_s:g} s apart; correct the times, or keep only the stretch of "
+        "this video."
+    )
 
 
 def _content_lines(path: Path) -> list[tuple[int, str]]:

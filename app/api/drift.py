@@ -8,7 +8,6 @@ import numpy as np
 from fastapi import APIRouter
 from pydantic import Field
 
-from app.answers import plain
 from app.api.projects import Body
 from app.context import Context, Folder, Here
 from app.errors import Missing
@@ -18,7 +17,7 @@ from core.coordinates import Floats
 from core.drift import amplitude_spectrum, corner_sweep, filter_warnings, high_pass
 from core.errors import InputError
 from core.project import Drift, Positive
-from core.results import TargetHistory
+from core.results import TargetHistory, plain
 from core.solve import unfiltered_history
 
 router = APIRouter(prefix="/api/projects/{project_id}")

@@ -12,7 +12,7 @@ from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from app import orthoimages
-from app.answers import plain, points
+from app.answers import points
 from app.api.projects import Body
 from app.context import Context, Folder, Here
 from app.errors import ApiError, Invalid, NotYet
@@ -26,6 +26,7 @@ from core.errors import InputError
 from core.georeference import COVERAGE_CELLS, ReferenceFit
 from core.preview import TargetPreview, preview_bands, preview_target
 from core.project import LINE_NAMES, Band, Correspondence, Project, Target
+from core.results import plain
 
 router = APIRouter(prefix="/api/projects/{project_id}")
 

@@ -19,7 +19,15 @@ from app.errors import ApiError, Invalid, Missing
 from app.frames import fingerprint
 from app.jobs import Finish
 from app.places import SUFFIXES_OF_CLOUD_TABLES, kind_of
-from app.store import CHECKERBOARD_FOLDER, INPUT_KINDS, ProjectFolder, problem_of, read_json, stored_inputs
+from app.store import (
+    CHECKERBOARD_FOLDER,
+    INPUT_KINDS,
+    ProjectFolder,
+    plain_name,
+    problem_of,
+    read_json,
+    stored_inputs,
+)
 from app.uploads import receive_file
 from app.videos import is_read_through, video_info
 from core.errors import InputError
@@ -76,7 +84,7 @@ def _wanted(entry: dict[str, Any], kind: str | None) -> bool:
 @router.put("/projects/{project_id}/upload/{kind}")
 async def upload(kind: UploadKind, filename: str, request: Request, folder: Folder, here: Here) -> dict[str, Any]:
     """Take in a file as the raw body; a checkerboard picture is kept beside the inputs, all others become the input."""
-    name = folder.free_name(filename)
+    name = plain_name(filename)
     if kind == "checkerboard" and kind_of(Path(name)) != "image":
         raise Invalid(f"{name}: is no picture; send JPEG, PNG or TIFF files of the checkerboard.", path="filename")
     part = folder.part_file()
@@ -90,18 +98,24 @@ def _take_in(here: Context, folder: ProjectFolder, kind: UploadKind, part: Path,
             (folder.folder / CHECKERBOARD_FOLDER).mkdir(exist_ok=True)
             os.replace(part, folder.folder / CHECKERBOARD_FOLDER / name)
             return {"file": f"{CHECKERBOARD_FOLDER}/{name}", "revision": folder.load().head.revision}
-        os.replace(part, folder.folder / name)
+        saved = folder.take_in(kind, part, name)
     finally:
         part.unlink(missing_ok=True)
-    saved = folder.change_input(kind, folder.folder / name, label=f"take in {kind} {name}")
-    tell_saved(here, folder, saved, f"take in {kind} {name}")
+    file = stored_inputs(saved.project.inputs)[kind]
+    tell_saved(here, folder, saved, f"take in {kind} {file}")
     here.hub.publish(folder.id, "inputs", {"kind": kind})
-    return {"file": name, "revision": saved.head.revision}
+    return {"file": file, "revision": saved.head.revision}
 
 
 @router.get("/projects/{project_id}/inputs")
-def inputs(folder: Folder, here: Here) -> dict[str, Any]:
-    """Return what was understood of each input: null, an error, or its facts."""
+def inputs(folder: Folder, here: Here, again: bool = False) -> dict[str, Any]:
+    """Return what was understood of each input: null, an error, or its facts.
+
+    Args:
+        again: whether a cloud is read anew where reading it broke off.
+    """
+    if again:
+        here.sites.forget_failure(folder)
     project = folder.load().project
     return {kind: _understood(here, folder, project, kind) for kind in INPUT_KINDS}
 

@@ -70,17 +70,18 @@ class Revision(Body):
 @router.get("")
 def list_projects(here: Here) -> list[dict[str, Any]]:
     """Return all projects with the state of their steps, the last edited first."""
-    return [_listed(here, folder) for folder in here.workspace.projects()]
+    return [_listed(here, project_id) for project_id in here.workspace.ids()]
 
 
-def _listed(here: Context, folder: ProjectFolder) -> dict[str, Any]:
+def _listed(here: Context, project_id: str) -> dict[str, Any]:
     try:
+        folder = here.workspace.open(project_id)
         project = folder.load().project
     except (InputError, ApiError) as error:
-        steps, name = steps_of_broken(problem_of(error)), folder.id
+        steps, name = steps_of_broken(problem_of(error)), project_id
     else:
         steps, name = steps_of(here, folder, project, look=False).steps, project.name
-    return {"id": folder.id, "name": name, "updated_s": folder.updated_s, "steps": steps}
+    return {"id": project_id, "name": name, "updated_s": here.workspace.updated_s(project_id), "steps": steps}
 
 
 @router.post("")

@@ -11,7 +11,7 @@ from fastapi import APIRouter
 from fastapi.responses import FileResponse, Response
 
 from app import outcome
-from app.answers import plain, points
+from app.answers import points
 from app.api.projects import Body
 from app.context import Context, Folder, Here
 from app.errors import ApiError, Missing, NotYet
@@ -21,7 +21,7 @@ from app.places import Places
 from app.store import CACHE_FOLDER, ProjectFolder
 from core.errors import InputError
 from core.project import Method, Project
-from core.results import TargetHistory
+from core.results import TargetHistory, plain
 from core.review import FrameOverlay, frame_overlay
 
 router = APIRouter(prefix="/api/projects/{project_id}")
@@ -84,7 +84,7 @@ def track_state(folder: Folder, here: Here) -> dict[str, Any]:
     """Return how far the measurement is, and the displacement so far."""
     project = folder.load().project
     job = _running(here, folder) or here.jobs.latest(folder.id, "track")
-    running = job is not None and job.state in ("queued", "running")
+    running = job is not None and job.is_running
     state = outcome.state_of(folder, project)
     resumable = not running and state.frames_done > 0 and not state.finished
     message = "" if job is None else job.message

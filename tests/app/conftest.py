@@ -60,7 +60,7 @@ def finished(client: TestClient) -> Callable[[dict[str, Any]], dict[str, Any]]:
 
     def wait(job: dict[str, Any]) -> dict[str, Any]:
         deadline = time.monotonic() + 60
-        while job["state"] in ("queued", "running"):
+        while job["state"] == "running":
             assert time.monotonic() < deadline, f"the job does not end: {job}"
             time.sleep(0.05)
             job = client.get(f"/api/jobs/{job['id']}").json()["job"]

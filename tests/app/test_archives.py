@@ -21,9 +21,9 @@ from core.locks import LOCK_FILE
 SMALL = "/api/projects/small"
 
 
-def packed(files: dict[str, bytes], project: bytes | None = None) -> bytes:
+def packed(files: dict[str, bytes], project: bytes | None = None, method: int = zipfile.ZIP_DEFLATED) -> bytes:
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(stream, "w", method) as archive:
         if project is not None:
             archive.writestr("project.json", project)
         for name, content in files.items():
@@ -124,6 +124,17 @@ def test_an_archive_that_lies_about_a_size_is_refused(client: TestClient, worksp
 )
 def test_what_is_no_project_is_refused(client: TestClient, workspace: Path, content: bytes, message: str) -> None:
     assert message in restore(client, content).json()["error"]["message"]
+    assert names(workspace) == ["small"]
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_an_archive_damaged_in_what_was_packed_is_refused(
+    client: TestClient, workspace: Path, project: bytes, method: int
+) -> None:
+    content = packed({"notes.txt": b"\n".join(b"%d" % number for number in range(5000))}, project, method)
+    place = content.find(b"notes.txt") + 50
+    answer = restore(client, content[:place] + b"\xff" * 20 + content[place + 20 :])
+    assert (answer.status_code, "damaged" in answer.json()["error"]["message"]) == (422, True)
     assert names(workspace) == ["small"]
 
 

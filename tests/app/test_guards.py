@@ -14,7 +14,7 @@ from core.errors import InputError
 SMALL = "/api/projects/small"
 
 
-@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "", "192.168.0.7:8000"])
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "", "192.168.0.7:8000", "[", "[::1"])
 def test_a_name_that_is_not_this_computer_is_refused(client: TestClient, host: str) -> None:
     answer = client.get("/api/projects", headers={"Host": host})
     assert (answer.status_code, answer.json()["error"]["path"]) == (403, "Host")
@@ -25,7 +25,9 @@ def test_this_computer_by_any_of_its_names_is_served(client: TestClient, host: s
     assert client.get("/api/projects", headers={"Host": host}).status_code == 200
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:9999", "http://localhost:8000"])
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "http://127.0.0.1:9999", "http://localhost:8000", "http://["]
+)
 def test_another_sites_page_cannot_change_anything(client: TestClient, origin: str) -> None:
     answer = client.delete(SMALL, headers={"Origin": origin})
     assert (answer.status_code, answer.json()["error"]["path"]) == (403, "Origin")

@@ -38,6 +38,37 @@ def test_a_file_that_is_sent_becomes_the_input(client: TestClient, workspace: Pa
     assert (state["revision"], state["undo_label"]) == (answer["revision"], "take in lens my lens.yaml")
 
 
+@pytest.mark.parametrize(
+    ("kind", "name", "kept", "free"),
+    [
+        ("gps", "site.csv", "cloud", "site-2.csv"),
+        ("lens", "video.mp4", "video", "video-2.mp4"),
+        ("lens", "lens.yaml", None, "lens.yaml"),
+        ("lens", "notes.yaml", None, "notes-2.yaml"),
+    ],
+)
+def test_a_file_that_is_sent_replaces_nothing_but_that_very_input(
+    client: TestClient, workspace: Path, kind: str, name: str, kept: str | None, free: str
+) -> None:
+    (workspace / "small" / "notes.yaml").write_text("no input, but somebody's file")
+    before = {path.name: path.read_bytes() for path in (workspace / "small").iterdir() if path.is_file()}
+    assert send(client, kind, name, b"new").json()["file"] == free
+    assert (workspace / "small" / free).read_bytes() == b"new"
+    for other in before.keys() - {free, "project.json", "history.sqlite"}:
+        assert (workspace / "small" / other).read_bytes() == before[other]
+    inputs = client.get(SMALL).json()["project"]["inputs"]
+    assert (inputs["gps"]["file"] if kind == "gps" else inputs[kind]) == free
+    assert kept is None or inputs[kept] == name
+
+
+def test_a_name_kept_for_an_input_that_is_still_to_come_is_not_free(client: TestClient) -> None:
+    made = client.post("/api/projects", json={"name": "empty"}).json()["id"]
+    sent = client.put(f"/api/projects/{made}/upload/lens", params={"filename": "video.mp4"}, content=b"x")
+    assert sent.json()["file"] == "video-2.mp4"
+    sent = client.put(f"/api/projects/{made}/upload/video", params={"filename": "video.mp4"}, content=b"x")
+    assert sent.json()["file"] == "video.mp4"
+
+
 def test_a_gps_record_keeps_the_names_of_its_columns(client: TestClient, workspace: Path) -> None:
     send(client, "gps", "again.csv", (workspace / "small" / "gps.csv").read_bytes())
     gps = client.get(SMALL).json()["project"]["inputs"]["gps"]
@@ -284,3 +315,17 @@ def test_an_address_leads_to_no_file_of_this_computer(client: TestClient, worksp
     answer = client.get(f"{SMALL}/frames/0.jpg")
     assert answer.status_code == 403
     assert "name it by its path" in answer.json()["error"]["message"]
+
+
+def test_an_address_that_is_typed_is_kept_as_it_is(client: TestClient, workspace: Path) -> None:
+    def typed(address: str) -> Any:
+        state = client.get(SMALL).json()
+        project = state["project"] | {"inputs": state["project"]["inputs"] | {"video": address}}
+        return client.put(SMALL, json={"project": project, "revision": state["revision"]})
+
+    address = "memory://campaign/typed.mp4"
+    assert typed(address).json()["project"]["inputs"]["video"] == address
+    assert json.loads((workspace / "small" / "project.json").read_text())["inputs"]["video"] == address
+    refused = typed("file:///etc/hostname")
+    assert (refused.status_code, "name it by its path" in refused.json()["error"]["message"]) == (403, True)
+    assert typed(str(workspace / "small" / "video.mp4")).json()["project"]["inputs"]["video"] == "video.mp4"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -14,12 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from app.context import Context
 from app.jobs import JOB_FILE
 from app.outcome import recorded_of
 from app.server import create_app
+from core.lens import Lens, write_lens
 from core.results import CSV_HEADER
 from tests.app.conftest import ADDRESS, WRITE, TestClient
-from tests.app.measured import SIZE, displacement_m, write_measurable
+from tests.app.measured import FOCAL_PX, SIZE, displacement_m, write_measurable
 from tests.scenes.clips import measured_history
 
 FRAMES = 40
@@ -28,7 +31,7 @@ CLIP = "/api/projects/clip"
 
 def wait_for(client: TestClient, job: dict[str, Any]) -> dict[str, Any]:
     deadline = time.monotonic() + 120
-    while job["state"] in ("queued", "running"):
+    while job["state"] == "running":
         assert time.monotonic() < deadline, f"the job does not end: {job}"
         time.sleep(0.05)
         job = client.get(f"/api/jobs/{job['id']}").json()["job"]
@@ -141,6 +144,42 @@ def test_a_changed_project_makes_files_stale_and_is_solved_at_once(tracked: Test
     finally:
         tracked.post(f"{CLIP}/undo", json={"revision": changed["revision"]})
     assert not tracked.get(f"{CLIP}/results").json()["stale"]
+
+
+def test_results_are_fresh_while_the_content_of_every_input_is_that_of_the_run(tracked: TestClient) -> None:
+    workspace: Path = tracked.app.state.context.workspace.folder  # type: ignore[attr-defined]
+    lens = workspace / "clip" / "lens.yaml"
+    measured_with, made_s = lens.read_text(), lens.stat().st_mtime
+
+    def is_stale(text: str, modified_s: float) -> bool:
+        lens.write_text(text)
+        os.utime(lens, (modified_s, modified_s))
+        return bool(tracked.get(f"{CLIP}/results").json()["stale"])
+
+    other = measured_with + "# another lens\n"
+    try:
+        assert is_stale(other, made_s - 86_400)
+        assert is_stale(other, made_s + 86_400)
+        assert not is_stale(measured_with, made_s + 86_400)
+    finally:
+        assert not is_stale(measured_with, made_s)
+
+
+def test_results_are_fresh_when_they_come_back_from_an_archive(tracked: TestClient) -> None:
+    made = tracked.post("/api/projects/restore", content=tracked.get(f"{CLIP}/archive").content).json()["id"]
+    assert not tracked.get(f"/api/projects/{made}/results").json()["stale"]
+
+
+def test_what_is_solved_rests_on_the_inputs_of_the_very_project_asked_for(tracked: TestClient) -> None:
+    context: Context = tracked.app.state.context  # type: ignore[attr-defined]
+    folder = context.workspace.open("clip")
+    stored = folder.load().project
+    write_lens(folder.folder / "longer.yaml", Lens.ideal(SIZE, 1.1 * FOCAL_PX))
+    asked = stored.model_copy(update={"inputs": stored.inputs.model_copy(update={"lens": "longer.yaml"})})
+    for project, focal_px in ((asked, 1.1 * FOCAL_PX), (stored, FOCAL_PX)):
+        found = context.outcomes.solved(folder, project)
+        assert found.inputs.project == project
+        assert found.inputs.lens.focal_px == pytest.approx(focal_px)
 
 
 def test_the_scene_shows_camera_and_roof_lines_in_step_with_a_frame(tracked: TestClient) -> None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import sqlite3
 import time
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +87,43 @@ def test_undo_and_redo_survive_a_restart(client: TestClient, workspace: Path) ->
         assert state["project"]["name"] == "one"
         state = rename(restarted, "three", state["revision"]).json()
         assert not state["can_redo"]
+
+
+def _all_garbage(file: Path) -> None:
+    file.write_bytes(b"garbage" * 1000)
+
+
+def _one_page_garbage(file: Path) -> None:
+    """Spoil a page of the states and leave the header alone, so that the file opens and fails later."""
+    with closing(sqlite3.connect(file)) as database:
+        (page,) = database.execute("SELECT rootpage FROM sqlite_schema WHERE name = 'states'").fetchone()
+        (size,) = database.execute("PRAGMA page_size").fetchone()
+    content = bytearray(file.read_bytes())
+    content[(page - 1) * size : page * size] = b"\xff" * size
+    file.write_bytes(content)
+
+
+@pytest.mark.parametrize(("spoil", "answers"), [(_all_garbage, [200]), (_one_page_garbage, [422, 200])])
+def test_a_damaged_history_is_moved_aside_and_takes_nothing_else_down(
+    client: TestClient, workspace: Path, spoil: Callable[[Path], None], answers: list[int]
+) -> None:
+    get(client)
+    spoil(workspace / "small" / "history.sqlite")
+    for answer in answers:
+        listed = client.get("/api/projects")
+        assert listed.status_code == 200
+        assert listed.json()[0]["steps"]["inputs"]["status"] == ("done" if answer == 200 else "error")
+    assert (workspace / "small" / "history.sqlite.damaged").is_file()
+    edited = rename(client, "second", get(client)["revision"]).json()
+    assert edited["undo_label"] == "rename to second"
+
+
+def test_a_history_that_cannot_be_written_is_told(client: TestClient, workspace: Path) -> None:
+    (workspace / "small" / "history.sqlite").mkdir()
+    answer = client.get(SMALL)
+    assert answer.status_code == 422
+    assert "history.sqlite: cannot be used" in answer.json()["error"]["message"]
+    assert client.get("/api/projects").status_code == 200
 
 
 def test_undo_of_an_older_state_and_undo_of_nothing_are_conflicts(client: TestClient) -> None:
@@ -191,6 +231,23 @@ def test_a_broken_project_file_is_listed_with_its_problem(client: TestClient, wo
     assert "line 1" in project["steps"]["inputs"]["message"]
     answer = client.get(SMALL)
     assert (answer.status_code, answer.json()["error"]["kind"]) == (422, "input")
+
+
+def test_a_project_that_leads_elsewhere_is_listed_with_its_problem_and_keeps_no_server_from_starting(
+    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (workspace / "small").rename(tmp_path / "elsewhere")
+    (workspace / "small").symlink_to(tmp_path / "elsewhere")
+    half_sent = workspace / "near" / ".incoming-0123456789abcdef"
+    half_sent.parent.mkdir()
+    half_sent.touch()
+    (workspace / "near" / "project.json").write_bytes((tmp_path / "elsewhere" / "project.json").read_bytes())
+    with TestClient(create_app(workspace), base_url=ADDRESS, headers=WRITE) as client:
+        listed = {project["id"]: project for project in client.get("/api/projects").json()}
+    assert "outside the folders" in listed["small"]["steps"]["inputs"]["message"]
+    assert listed["near"]["name"] == "small"
+    assert not half_sent.exists()
 
 
 def test_the_trash_is_emptied_after_a_month(client: TestClient, context: Context, workspace: Path) -> None:

@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 import viser._messages as viser_messages
 from fastapi.testclient import TestClient
+from matplotlib.colors import to_rgb
 from starlette.websockets import WebSocketDisconnect
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
+from app import scene3d
 from app.context import Context
-from app.scene3d import CLIENT_FILE, TOKEN_HEADER, CloudView, Scene3D
+from app.scene3d import CLIENT_FILE, TOKEN_HEADER, CloudView, Scene3D, line_colours
+from core import figures
 
 HOST = {"Host": "127.0.0.1:8000"}
 ORIGIN = HOST | {"Origin": "http://127.0.0.1:8000"}
@@ -136,6 +139,17 @@ def test_points_in_utm_keep_their_millimetres(scene: Scene3D) -> None:
     shown = scene._started().scene.get_handle_by_name("/cloud")
     assert shown.points.dtype == np.float32
     assert np.asarray(shown.points, dtype=float) == pytest.approx(local, abs=2e-6)
+
+
+def test_roof_lines_have_the_colours_of_the_report_and_nothing_else_has(scene: Scene3D) -> None:
+    scene.open("colours", np.zeros(3), lambda start, along: None)
+    ends = {f"roof/{name}": np.array([[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]]) for name in figures.LINE_COLOURS}
+    scene.set_lines(ends, {}, "key")
+    shown = scene._started().scene
+    for name, colour in figures.LINE_COLOURS.items():
+        drawn = shown.get_handle_by_name(f"/lines/moved/roof/{name}").colors
+        assert np.unique(drawn.reshape(-1, 3), axis=0) == pytest.approx(np.array(to_rgb(colour))[None] * 255)
+    assert not set(line_colours().values()) & {scene3d._GROUND_COLOUR, scene3d._PATH_COLOUR, scene3d._FRUSTUM_COLOUR}
 
 
 def test_a_click_is_given_in_world_coordinates(scene: Scene3D) -> None:

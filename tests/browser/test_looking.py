@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
-from app.scene3d import LINE_COLOURS
+from app.scene3d import line_colours
 from tests.browser.hands import Placement, fitted, zoomed
 from tests.browser.live import ask, ask_bytes, free_port, measured_sample, serving, shared_folder, watched
 from tests.browser.steps import FRAME_SIZE, pane, pixels, ready
@@ -173,7 +173,7 @@ def roof_line(page: Page) -> np.ndarray:
     for _ in range(40):
         page.wait_for_timeout(800)  # the scene fades in, and follows with a little delay
         picture = np.asarray(Image.open(BytesIO(frame.screenshot())).convert("RGB"), np.int16)
-        alike = np.abs(picture - LINE_COLOURS["L1"]).max(axis=2) < ALIKE_LEVELS
+        alike = np.abs(picture - line_colours()["L1"]).max(axis=2) < ALIKE_LEVELS
         alike[:, : alike.shape[1] // 3] = False  # the slider has the same blue
         rows, columns = np.nonzero(alike)
         if len(rows) > 5:

@@ -58,6 +58,7 @@ def results(video: Path, project: Project, solution: Solution, **changes: Any) -
         gps=None,
         video=video,
         sha256={"video.mp4": "ab" * 32, "lens.yaml": "cd" * 32, "gps.csv": "ef" * 32},
+        identity={"video.mp4": "12" * 32, "lens.yaml": "34" * 32, "gps.csv": "56" * 32},
         version="0.1.0",
         frames_measured=scene.FRAMES,
         measuring_s=6.0,

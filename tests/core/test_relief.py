@@ -4,11 +4,16 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from core.camera import Pose, project
 from core.cloud import fit_ground_plane, make_cloud
 from core.coordinates import Bools, Floats
+from core.errors import InputError
+from core.project import Project
 from core.relief import Relief, rasterise
+from core.run import relief_plan
+from tests.small_project import document
 
 SITE_M = np.array([651_234.0, 3_872_345.0])
 CAMERA = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 40.0]))
@@ -73,3 +78,8 @@ def test_what_is_stored_is_found_again(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.standing_m, site().standing_m, atol=1e-6)
     (tmp_path / "broken.npz").write_bytes((tmp_path / "relief.npz").read_bytes()[:500])
     assert Relief.load(tmp_path / "broken.npz") is None
+
+
+def test_a_cloud_that_is_not_there_is_named_with_its_remedy(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"site\.csv: not found; correct inputs\.cloud"):
+        relief_plan(tmp_path, Project.model_validate(document()))

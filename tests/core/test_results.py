@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from core.results import (
     Status,
     TargetHistory,
     displacement_at,
+    plain,
     read_history_csv,
     relative_history,
     summarise,
@@ -232,6 +233,18 @@ def test_summary_says_null_where_nothing_can_be_told() -> None:
     assert rows["pre_event_rms_m"] is None
     assert rows["rotation_peak_rad"] is None
     assert rows["sigma_median_m"] is None
+
+
+@dataclass(frozen=True)
+class Fit:
+    residuals_px: Floats
+    counts: tuple[float, ...]
+
+
+def test_what_a_dataclass_holds_is_told_by_field() -> None:
+    told = plain({"fit": Fit(np.array([[1.0, np.nan], [2.0, 3.0]]), (np.int64(3), np.inf))})
+    assert told == {"fit": {"residuals_px": [[1.0, None], [2.0, 3.0]], "counts": [3, None]}}
+    assert json.loads(json.dumps(told, allow_nan=False)) == told
 
 
 def test_summary_file_is_plain_json(tmp_path: Path) -> None:

@@ -14,8 +14,7 @@ from fsspec.spec import AbstractBufferedFile, AbstractFileSystem
 
 from core import storage
 from core.errors import InputError
-from core.prediction import video_identity
-from core.storage import FarFile, file_at, opened, state_of
+from core.storage import FarFile, content_identity, file_at, opened, state_of
 from core.video import frame_index, probe, read_frame, read_frames
 from tests.core.test_video import FRAMES, number_of, write
 
@@ -66,7 +65,7 @@ def test_far_away_a_video_is_the_same(video, bucket):
     far = FarFile(f"bucket://{video}")
     assert probe(far) == probe(video)
     assert frame_index(far) == frame_index(video)
-    assert video_identity(far) == video_identity(video)
+    assert content_identity(far) == content_identity(video)
     near, distant = list(read_frames(video, 70, 90)), list(read_frames(far, 70, 90))
     assert [(frame.index, frame.time_s) for frame in distant] == [(frame.index, frame.time_s) for frame in near]
     assert all((one.luma == other.luma).all() for one, other in zip(near, distant, strict=True))
@@ -90,6 +89,17 @@ def test_a_file_in_memory_serves_as_well(tmp_path):
     assert len(frame_index(far)) == FRAMES
     assert [number_of(frame.luma) for frame in read_frames(far, 20, 24)] == [20, 21, 22, 23]
     assert state_of(far).size == len(content)
+
+
+def test_content_has_a_name_that_goes_with_it(tmp_path):
+    first, copy, other = (tmp_path / name for name in ("first.csv", "copy.csv", "other.csv"))
+    first.write_text("0, 1, 2\n")
+    copy.write_text("0, 1, 2\n")
+    other.write_text("0, 1, 3\n")
+    os.utime(copy, (1.0, 1.0))
+    assert content_identity(first) == content_identity(copy) != content_identity(other)
+    with pytest.raises(FileNotFoundError):
+        content_identity(tmp_path / "gone.csv")
 
 
 def test_a_changed_file_is_noticed(tmp_path, bucket):

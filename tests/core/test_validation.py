@@ -195,12 +195,22 @@ def test_reads_named_columns_and_passes_over_the_rest(tmp_path: Path, separator:
             "time_s,east_m,north_m\n0,1,2\n2,1,2\n\n1,1,2\n3,1,2\n",
             r'line 5: "time_s" is 1, not after the line before \(2\)',
         ),
+        (
+            "time_s,east_m,north_m\n0,1,2\n# receiver on\n1700000000,1,2\n1700000000.5,1,2\n1700000001,1,2\n",
+            r"line 4: its time is 1\.7e\+09 s after that of the line before, 0 s, .* 0\.5 s apart; correct the times",
+        ),
         ("", r"is empty"),
     ],
 )
 def test_bad_records_are_refused_by_line(tmp_path: Path, body: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_gps(write(tmp_path, body), settings())
+
+
+def test_a_record_may_have_a_gap_of_days(tmp_path: Path) -> None:
+    days_s = 3 * 86_400
+    body = "time_s,east_m,north_m\n" + "".join(f"{time_s},1,2\n" for time_s in (0, 0.1, 0.2, days_s, days_s + 0.1))
+    assert len(read_gps(write(tmp_path, body), settings()).time_s) == 5
 
 
 def test_missing_and_binary_files_are_refused(tmp_path: Path) -> None:

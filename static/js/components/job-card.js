@@ -9,7 +9,7 @@ import { toastError } from "./toast.js";
 /** @typedef {import("../lib/types.js").Job} Job */
 
 /** Whether a job still works. @param {Job | null} job */
-export const isRunning = (job) => job !== null && (job.state === "running" || job.state === "queued");
+export const isRunning = (job) => job !== null && job.state === "running";
 
 /** A card that shows a job while it runs, and why it failed. Empty and hidden otherwise. @param {{unit?: string}} [options] unit: of done and total ("frames") */
 export function jobCard({ unit = "" } = {}) {
@@ -38,11 +38,7 @@ export function jobCard({ unit = "" } = {}) {
       element.classList.toggle("failed", failed);
       cancel.hidden = !isRunning(job);
       bar.hidden = failed;
-      stage.textContent = failed
-        ? (job.message ?? "Failed")
-        : job.state === "queued"
-          ? "Waiting for its turn"
-          : job.stage || "Starting";
+      stage.textContent = failed ? (job.message ?? "Failed") : job.stage || "Starting";
       numbers.textContent = isRunning(job) ? progressWords(job, unit) : "";
       if (job.total > 0) bar.value = job.done / job.total;
       else bar.removeAttribute("value");

@@ -51,7 +51,7 @@
  * @typedef {object} Job
  * @property {string} id
  * @property {string} kind
- * @property {"queued" | "running" | "done" | "failed" | "cancelled" | "interrupted"} state
+ * @property {"running" | "done" | "failed" | "cancelled" | "interrupted"} state
  * @property {string} stage
  * @property {number} done
  * @property {number} total

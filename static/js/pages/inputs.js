@@ -123,9 +123,10 @@ fill(
   report.element,
 );
 
-async function load() {
+/** @param {{again?: boolean}} [options] again: have a cloud read anew where reading it broke off */
+async function load({ again = false } = {}) {
   try {
-    const facts = await get(projectPath(page.id, "inputs"));
+    const facts = await get(projectPath(page.id, "inputs", again ? { again: 1 } : {}));
     for (const [kind, card] of cards) card.show(facts[kind]);
     columns.hidden = facts.gps === null;
   } catch (error) {
@@ -151,7 +152,7 @@ function showJob(running) {
     toast("The lens is calibrated and in use.", { tone: "good" });
     void report.refresh();
   }
-  if (running.state === "done") void load();
+  if (running.state === "done" || running.state === "failed") void load();
 }
 
 store.on("change", ({ project, previous, origin }) => {
@@ -163,4 +164,4 @@ page.events.on("inputs", () => void load());
 page.events.on("job", showJob);
 page.events.on("hello", ({ job: running }) => showJob(running));
 showProblems();
-await Promise.all([load(), report.refresh()]);
+await Promise.all([load({ again: true }), report.refresh()]);

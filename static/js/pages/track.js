@@ -296,7 +296,7 @@ function buttons(done) {
 function showRunning(job) {
   const share = job.total > 0 ? job.done / job.total : null;
   const bar = h("progress", { max: 1, "aria-label": "Progress", value: share });
-  const title = job.state === "queued" ? "Waiting for its turn" : (STAGES[job.stage] ?? (job.stage || "Starting"));
+  const title = STAGES[job.stage] ?? (job.stage || "Starting");
   fill(
     controls,
     h(
