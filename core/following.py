@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.coordinates import Floats, apply_homography, finite_rows
+from core.errors import InputError
 from core.ground import ALIKE_SCORE, NOISY_ROUNDS, View, choose_features_within, homography_jacobian
 from core.lens import Lens
 from core.motion import LineSet, RigidFit, fit_line, is_determined, rigid_from_points, rough_rigid_from_lines
@@ -37,6 +38,8 @@ LINE_SEARCH_M = 0.14
 CONFIRM_EVERY = 15
 # Another place than where strips were found must show this part of them at least.
 AS_WELL = 0.8
+# Stations of a line that must be seen for it to count.
+LEAST_STATIONS = STATIONS // 4
 POINTS = 160
 
 
@@ -155,7 +158,14 @@ class LinesFollower:
             LineTracker(luma, end, still, width_px=width, name=name)
             for end, width, name in zip(ends, widths_px, names, strict=True)
         ]
-        self.reference_raw = np.stack([tracker.find(luma, still).edges_raw for tracker in self.trackers])
+        matches = [tracker.find(luma, still) for tracker in self.trackers]
+        for match, name in zip(matches, names, strict=True):
+            if match.measured < LEAST_STATIONS:
+                raise InputError(
+                    f"{name} shows a line with two edges in only {match.measured} of {STATIONS} places of the "
+                    "reference frame; draw the band along a strip or joint, or choose another reference_frame."
+                )
+        self.reference_raw = np.stack([match.edges_raw for match in matches])
         rays = lens.rays_from_raw(self.reference_raw.mean(axis=2))
         lines = [fit_line(points, np.ones(STATIONS), self._centre) for points in rays]
         self._lines = LineSet(np.array([n for n, _ in lines]), np.array([o for _, o in lines]), self._centre)
@@ -188,7 +198,7 @@ class LinesFollower:
         return TargetMatch(np.stack([match.edges_raw for match in matches]), apparent)
 
     def _apparent(self, matches: list[LineMatch], H_ray_ray0: Floats, predicted: Apparent) -> Apparent | None:
-        usable = [match if match.measured >= STATIONS // 4 else NOT_FOUND for match in matches]
+        usable = [match if match.measured >= LEAST_STATIONS else NOT_FOUND for match in matches]
         rays = self._lens.rays_from_raw(np.stack([match.midline_raw for match in usable]))
         rays0 = apply_homography(np.linalg.inv(H_ray_ray0), rays)
         return _apparent_of(rough_rigid_from_lines(rays0, self._lines, predicted.shift, predicted.rotation_rad))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from core.coordinates import Floats
+from core.errors import InputError
 from core.following import Apparent, LinesFollower, PointsFollower, Scale
 from core.ground import View
 from core.lens import Lens
@@ -34,6 +35,14 @@ def follower() -> LinesFollower:
     ends = LENS.rays_from_raw(BANDS.astype(float))
     scale = Scale(rays_per_m=PX_PER_M / FOCAL_PX, pixels_per_m=PX_PER_M)
     return LinesFollower(roof(), ends, LENS, widths_px=[14.0] * 3, scale=scale, names=["L1", "L2", "T1"])
+
+
+def test_bands_that_hold_nothing_but_noise_are_refused() -> None:
+    noise = frame(np.random.default_rng(1).uniform(0, 255, SIZE[::-1]))
+    ends = LENS.rays_from_raw(BANDS.astype(float))
+    scale = Scale(rays_per_m=PX_PER_M / FOCAL_PX, pixels_per_m=PX_PER_M)
+    with pytest.raises(InputError, match=r"^L1 shows a line with two edges in only \d+ of 64 places"):
+        LinesFollower(noise, ends, LENS, widths_px=[14.0] * 3, scale=scale, names=["L1", "L2", "T1"])
 
 
 def shift_px(apparent: Apparent | None) -> Floats:
