@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from core.camera import Pose, PoseFit, intersect_height
-from core.coordinates import Bools, Floats, batches, finite_median
+from core.coordinates import Bools, Floats, batches
 from core.lens import Lens
 from core.measurements import Recording
 from core.motion import (
@@ -20,6 +20,7 @@ from core.motion import (
     rigid_from_points,
     rigid_with_weights,
 )
+from core.robust import finite_median
 
 # Frames fitted at a time; what scatter is usual is told from them.
 BATCH = 1024

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from core.bodies import midpoints, rest_body, world_points
 from core.camera import Pose, PoseFit, fit_poses
-from core.coordinates import Bools, Floats, evenly_spread, finite_median, finite_rows
+from core.coordinates import Bools, Floats, evenly_spread, finite_rows
 from core.georeference import ReferenceFit, reference_centre_sigma, reference_pose
 from core.ground_poses import click_elevation, ground_points, solve_ground
 from core.intervals import during, within
@@ -24,6 +24,7 @@ from core.measurements import Recording
 from core.motion import is_determined
 from core.project import Project, Target
 from core.relief import Relief
+from core.robust import finite_median, robust_sigma
 from core.row_times import ALIKE
 from core.self_calibration import Parameter, SelfCalibration, refused, self_calibrate
 from core.solution import Ground
@@ -204,7 +205,7 @@ def _noise(motion: Floats) -> Floats:
     """Return the noise (K,) of moments (B, K), from how unevenly they follow each other; boundless if they are few."""
     if len(motion) < 3:
         return np.full(motion.shape[1], np.inf)
-    return np.maximum(1.4826 * finite_median(np.abs(np.diff(motion, n=2, axis=0)).T) / np.sqrt(6.0), LEAST_NOISE_M)
+    return np.maximum(robust_sigma(np.diff(motion, n=2, axis=0).T) / np.sqrt(6.0), LEAST_NOISE_M)
 
 
 @dataclass(frozen=True)
@@ -296,7 +297,7 @@ def ground_misfit(evidence: Evidence) -> Callable[[Floats], Floats]:
         return np.where(known[..., None], found - own, 0.0) * np.sqrt(weight)[..., None]
 
     first = left_over(np.zeros(len(evidence.parameters)))
-    noise = ALIKE * 1.4826 * float(np.median(np.abs(first[agree]))) if agree.any() else 1.0
+    noise = ALIKE * float(robust_sigma(first[agree].ravel())) if agree.any() else 1.0
     return lambda correction: left_over(correction).ravel() / max(noise, 1e-9)
 
 

@@ -12,12 +12,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.coordinates import Floats, batches, finite_median, finite_rows
+from core.coordinates import Floats, batches, finite_rows
+from core.robust import TUKEY, robust_sigma
 
 # Frames solved together: bounds the memory of the normal equations to some tens of MB at 500 points a frame.
 BATCH = 96
-# Tukey's biweight at 95 % efficiency under normal noise (Holland & Welsch 1977).
-TUKEY = 4.685
 
 
 @dataclass(frozen=True)
@@ -208,7 +207,7 @@ def _fit_batch(
         residual = observed - predicted
         if robust:
             # Of a point that is known to be good, little is already too much.
-            sigma = np.maximum(robust_sigma(root * residual, seen), sigma_floor)
+            sigma = np.maximum(_sigma_seen(root * residual, seen), sigma_floor)
             # A wide funnel first, so that a poor start does not throw good points out.
             funnel = 4.0 if iteration < 2 else 1.0
             used = base * _tukey(root * residual, funnel * sigma)
@@ -222,7 +221,7 @@ def _fit_batch(
     predicted, J = jacobians(R, C, points_m)
     residual = np.where(seen[..., None], observed - predicted, np.nan)
     normal, _ = _normal(J, np.zeros_like(observed), used)
-    return R, C, residual, used, normal, np.maximum(robust_sigma(residual, used > 0), sigma_floor)
+    return R, C, residual, used, normal, np.maximum(_sigma_seen(residual, used > 0), sigma_floor)
 
 
 def _normal(J: Floats, residual: Floats, weight: Floats) -> tuple[Floats, Floats]:
@@ -243,10 +242,9 @@ def _solve_damped(A: Floats, g: Floats) -> Floats:
     return np.where(usable[:, None] & np.isfinite(step), step, 0.0)
 
 
-def robust_sigma(residual: Floats, seen: NDArray[np.bool_]) -> Floats:
-    """Return each frame's standard deviation of one coordinate, (F,), from the median absolute residual."""
-    magnitude = np.where(seen[..., None], np.abs(residual), np.nan).reshape(len(residual), -1)
-    return 1.4826 * finite_median(magnitude)
+def _sigma_seen(residual: Floats, seen: NDArray[np.bool_]) -> Floats:
+    """Return each frame's robust standard deviation (F,) of one coordinate of the residuals (F, N, 2) that are seen."""
+    return robust_sigma(np.where(seen[..., None], residual, np.nan).reshape(len(residual), -1))
 
 
 def _tukey(residual: Floats, sigma: Floats) -> Floats:

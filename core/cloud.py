@@ -20,6 +20,7 @@ from core.coordinates import Floats, batches, read_only
 from core.errors import InputError
 from core.point_files import PointTable, read_pcd, read_ply, read_text
 from core.progress import Progress, silent
+from core.robust import BY_MEDIAN, robust_sigma
 
 _LAS_CHUNK_POINTS = 2_000_000
 # ASPRS classes of points that are no surface: low noise and high noise.
@@ -437,7 +438,7 @@ def _refined(points: Floats, plane: tuple[float, float, float]) -> tuple[float, 
     for _ in range(4):
         a, b, c = _least_squares_plane(kept)
         off = cells[:, 2] - (a * cells[:, 0] + b * cells[:, 1] + c)
-        scatter = 1.4826 * float(np.median(np.abs(off - np.median(off))))
+        scatter = float(robust_sigma(off - np.median(off)))
         kept = cells[np.abs(off) <= max(3.0 * scatter, 0.01)]
     return float(a), float(b), float(c)
 
@@ -466,7 +467,7 @@ def _described(cloud: Cloud, at_m: tuple[float, float, float], slope: tuple[floa
     places[:, 2] = heights[some]
     relief = _medians_of_cells(places, 0.1)[:, 2]
     middle = float(np.median(relief))
-    scatter = 1.4826 * float(np.median(np.abs(relief - middle)))
+    scatter = float(robust_sigma(relief - middle))
     relief = relief[np.abs(relief - middle) <= max(4.0 * scatter, 0.02)]
     p5, p95 = np.percentile(relief, [5, 95])
     return replace(
@@ -565,7 +566,7 @@ def _local_planes(offsets: Floats, heights: Floats, owner: NDArray[np.int64], ra
     middle = _group_medians(heights, owner)
     off = heights - middle[owner]
     for _ in range(5):
-        scale = np.maximum(1.4826 * _group_medians(np.abs(off), owner), 0.002)
+        scale = np.maximum(BY_MEDIAN * _group_medians(np.abs(off), owner), 0.002)
         weight = nearness * np.clip(1.0 - (off / (4.7 * scale[owner])) ** 2, 0.0, None) ** 2
         products = weight[:, None, None] * design[:, :, None] * design[:, None, :]
         sums = [np.bincount(owner, product, count) for product in products.reshape(-1, 9).T]

@@ -60,15 +60,6 @@ def finite_rows(points: Floats) -> Bools:
     return np.asarray(np.isfinite(points).all(axis=-1), dtype=np.bool_)
 
 
-def finite_median(values: Floats) -> Floats:
-    """Return the median of what is finite along the last axis; 0 where nothing is. Quicker than numpy's own."""
-    ordered = np.sort(np.where(np.isfinite(values), values, np.inf), axis=-1)
-    count = np.isfinite(ordered).sum(axis=-1, keepdims=True)
-    low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=-1)
-    high = np.take_along_axis(ordered, np.minimum(count // 2, ordered.shape[-1] - 1), axis=-1)
-    return np.asarray(np.where(count > 0, 0.5 * (low + high), 0.0)[..., 0])
-
-
 def batches(count: int, size: int) -> Iterator[slice]:
     """Yield slices of at most `size` that cover `count` places; one empty slice where there are none."""
     return (slice(first, first + size) for first in range(0, max(count, 1), size))

@@ -17,6 +17,7 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from core.coordinates import Floats
+from core.robust import robust_sigma
 
 DEGREE = 5
 # The derivative of the path that is taken as white: the path sinks into the noise within half an octave.
@@ -130,7 +131,7 @@ def _prediction_errors(spline: _Spline, time_s: Floats, value_m: Floats, size: F
             out = fold == run
             error[out] = (x - spline.fit(x, np.where(out, np.inf, size))[0])[out] / size[out]
         # A single wild pose must not decide, but a path that cuts corners must pay for it.
-        limit = 6.0 * 1.4826 * float(np.median(np.abs(error))) + LEAST_NOISE_M
+        limit = 6.0 * float(robust_sigma(error.ravel())) + LEAST_NOISE_M
         means.append(float((np.clip(error[inner], -limit, limit) ** 2).mean()))
     return np.array(means)
 
@@ -151,7 +152,7 @@ def _smooth(
     spline = _Spline(time_s, seen_s, cutoff_hz)
     path, factor = spline.fit(value_m, size)
     departure = (value_m - path[np.searchsorted(time_s, seen_s)]) / size
-    noise = max(1.4826 * float(np.median(np.abs(departure))), LEAST_NOISE_M)
+    noise = max(float(robust_sigma(departure.ravel())), LEAST_NOISE_M)
     limited = np.clip(departure, -OUTLYING * noise, OUTLYING * noise)
     noise = max(float(limited.std()), LEAST_NOISE_M)
     memory = float(np.clip((limited[1:] * limited[:-1]).mean() / noise**2, 0.0, 0.9))
@@ -192,7 +193,7 @@ class _Spline:
             coefficients: Floats = cho_solve_banded((factor, False), self._seen.T @ (weight * (value_m - mean)))
             path = self._every @ coefficients + mean
             departure = np.abs(value_m - mean - self._seen @ coefficients) / size
-            limit = OUTLYING * max(1.4826 * float(np.median(departure[trust > 0])), LEAST_NOISE_M)
+            limit = OUTLYING * max(float(robust_sigma(departure[trust > 0].ravel())), LEAST_NOISE_M)
             weight = trust * np.minimum(1.0, limit / np.maximum(departure, 1e-12)) ** 2
         return path, factor
 

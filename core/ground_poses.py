@@ -6,13 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.camera import Pose, PoseFit, fit_poses, intersect_height, plan_homographies, project
-from core.coordinates import Bools, Floats, evenly_spread, finite_median
+from core.coordinates import Bools, Floats, evenly_spread
 from core.georeference import ReferenceFit, fit_reference
 from core.lens import Lens
 from core.measurements import Recording
 from core.patches import HALF_PX
 from core.project import Project
 from core.relief import Relief
+from core.robust import finite_median, robust_sigma
 from core.solution import Ground
 
 # Ground points a frame needs; below half of the usual number it is weak.
@@ -119,7 +120,7 @@ def _repeated(ground_raw: Floats, rms_px: Floats, usable: Bools) -> Bools:
 def _change_px(ground_raw: Floats, frames: NDArray[np.int64]) -> Floats:
     """Return how unevenly features (F, N, 2) have moved since the frame before, in some frames (M,)."""
     moved = np.moveaxis(ground_raw[frames] - ground_raw[frames - 1], -1, 1)
-    return 1.4826 * finite_median(np.abs(moved - finite_median(moved)[..., None]).reshape(len(frames), -1))
+    return robust_sigma((moved - finite_median(moved)[..., None]).reshape(len(frames), -1))
 
 
 def _standing(rays: Floats, weight: Floats, points_m: Floats, poses: PoseFit, pose0: Pose, least_sigma: float) -> Bools:
@@ -138,7 +139,7 @@ def _standing(rays: Floats, weight: Floats, points_m: Floats, poses: PoseFit, po
     for _ in range(STANDING_ROUNDS):
         height, sigma = _heights(points_m, poses, pose0, least_sigma)
         usual = np.where(standing, np.nan, height)
-        spread = 1.4826 * finite_median(np.abs(usual - finite_median(usual)))
+        spread = robust_sigma(usual - finite_median(usual))
         found = standing | (np.abs(height) > np.maximum(STANDING_M, STANDING_SIGMA * np.maximum(sigma, spread)))
         if (found == standing).all():
             break
@@ -166,7 +167,7 @@ def _trust(poses: PoseFit) -> Floats:
     """
     residual = poses.residual[:: max(1, len(poses.residual) // TRUST_FRAMES)]
     own = residual - finite_median(np.moveaxis(residual, 0, -1))
-    sigma = 1.4826 * finite_median(np.moveaxis(np.abs(own), 1, 0).reshape(own.shape[1], -1))
+    sigma = robust_sigma(np.moveaxis(own, 1, 0).reshape(own.shape[1], -1))
     known = sigma > 0
     if not known.any():
         return np.ones(len(sigma))

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.coordinates import Bools, Floats, finite_median, finite_rows
+from core.coordinates import Bools, Floats, finite_rows
+from core.robust import biweight, finite_median, robust_sigma
 
-# Tukey's biweight at 95 % efficiency under normal noise (Holland & Welsch 1977).
-TUKEY = 4.685
 ITERATIONS = 8
 # Plain Gauss-Newton doubles the right digits each time; rotations are fractions of a degree.
 PLAIN_ITERATIONS = 4
@@ -87,7 +86,7 @@ def fit_line(points: Floats, weight: Floats, centre: Floats) -> tuple[Floats, fl
         normal = axes[1] if axes[1][np.argmax(np.abs(axes[1]))] > 0 else -axes[1]
         offset = float(normal @ mean)
         residual = x @ normal - offset
-        sigma = max(1.4826 * float(np.median(np.abs(residual))), 1e-12)
+        sigma = max(float(robust_sigma(residual)), 1e-12)
         used = prior * biweight(residual, (3.0 if iteration < 2 else 1.0) * sigma)
     return normal, offset
 
@@ -159,7 +158,7 @@ def regress_lines(points: Floats, least: int = 10) -> Regression:
     used, sigma, normal = seen.astype(np.float64), np.ones(x.shape[:2]), np.zeros((*x.shape[:2], 2, 2))
     for iteration in range(ITERATIONS):
         residual = np.where(seen, y - coefficients[..., :1] - coefficients[..., 1:] * x, np.nan)
-        sigma = np.maximum(1.4826 * _median(np.abs(residual), axis=-1), 1e-9)
+        sigma = np.maximum(robust_sigma(residual), 1e-9)
         used = np.where(seen, biweight(residual, (3.0 if iteration < 3 else 1.0) * sigma[..., None]), 0.0)
         design = np.stack([np.ones_like(x), x], axis=-1)
         normal = np.einsum("flk,flku,flkv->fluv", used, design, design)
@@ -175,12 +174,6 @@ def regress_lines(points: Floats, least: int = 10) -> Regression:
 def _direction(points: Floats) -> Floats:
     _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     return np.asarray(axes[0])
-
-
-def biweight(residual: Floats, sigma: Floats | float) -> Floats:
-    """Return Tukey's weights of residuals with a given standard deviation; nan residuals weigh nothing."""
-    ratio = np.nan_to_num((residual / (TUKEY * np.asarray(sigma))) ** 2, nan=1.0)
-    return np.asarray(np.where(ratio < 1.0, (1.0 - np.minimum(ratio, 1.0)) ** 2, 0.0))
 
 
 def rigid_from_lines(
@@ -216,7 +209,7 @@ def rigid_from_lines(
             normal, step = _gauss_newton(J[..., :2], residual, prior)
             shift = shift + step
             continue
-        sigma = np.maximum(1.4826 * _median(np.abs(masked), axis=-1), sigma_floor)
+        sigma = np.maximum(robust_sigma(masked), sigma_floor)
         sigma[~seen.any(axis=-1)] = np.nan
         usual = np.maximum(_median(sigma, axis=0), sigma_floor)
         funnel = 3.0 if iteration < 4 else 1.0

@@ -14,11 +14,10 @@ from typing import Any
 
 from core.georeference import PairResidual, ReferenceFit
 from core.project import Project, Target, write_atomically
+from core.self_calibration import SUSPICIOUS
 from core.validation import GpsComparison
 
 REPORT_FILE = "report.html"
-# Beyond this many prior standard deviations a correction says that an input is wrong, not that it is uncertain.
-SUSPICIOUS_CORRECTION = 3.0
 
 
 @dataclass(frozen=True)
@@ -325,7 +324,7 @@ def _calibration(content: ReportContent) -> str:
             correction.name,
             correction.before,
             correction.after,
-            f"{correction.in_priors:+.2f}" + (" !" if abs(correction.in_priors) > SUSPICIOUS_CORRECTION else ""),
+            f"{correction.in_priors:+.2f}" + (" !" if abs(correction.in_priors) > SUSPICIOUS else ""),
         ]
         for correction in content.corrections
     ]

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.coordinates import Bools, Floats, finite_median
+from core.coordinates import Bools, Floats
+from core.robust import robust_sigma
 
 # Corrections beyond this many priors mean that something else is wrong: another lens, another height.
 SUSPICIOUS = 3.0
@@ -152,7 +153,7 @@ def _derivatives(misfit: Callable[[Floats], Floats], at: Floats, value: Floats) 
 
 def _spread(own: Floats, usable: Bools) -> Floats:
     """Return the robust standard deviation (K,) of residuals (B, K) where they are used; 1 where none is."""
-    spread = 1.4826 * finite_median(np.where(usable, np.abs(own), np.nan).T)
+    spread = robust_sigma(np.where(usable, own, np.nan).T)
     return np.where(usable.any(axis=0), spread, 1.0)
 
 

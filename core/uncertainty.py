@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from core.coordinates import Bools, Floats, finite_median
+from core.coordinates import Bools, Floats
 from core.results import TargetHistory
+from core.robust import BY_MEDIAN, finite_median
 
 # What the ground errs by as a whole, as part of its features' scatter (measured on H.264 clips with exact truth).
 GROUND_PART = 0.05
@@ -58,7 +59,7 @@ def common_error(residual: Floats, time_s: Floats, still: Bools) -> Floats:
         own = _mean_seen(own.reshape(frames, rows, PIECES, count // PIECES))
     square = finite_median(np.abs(own).reshape(frames, -1)) ** 2
     window = max(1, round(AVERAGED_S / float(np.median(np.diff(time_s))))) if frames > 1 else 1
-    wandering = 1.4826 * np.sqrt(uniform_filter1d(square, window, mode="nearest"))
+    wandering = BY_MEDIAN * np.sqrt(uniform_filter1d(square, window, mode="nearest"))
     at_rest = max(float(np.median(wandering[usual])), 1e-12)
     return np.asarray(at_rest * np.maximum(wandering / at_rest, LEAST_WANDERING) ** GROWTH)
 

@@ -17,6 +17,7 @@ ORDER = (
     "errors",
     "progress",
     "coordinates",
+    "robust",
     "storage",
     "locks",
     "intervals",

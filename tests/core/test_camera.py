@@ -17,7 +17,6 @@ from core.camera import (
     plan_homography,
     pose_from_homography,
     project,
-    robust_sigma,
 )
 from core.coordinates import Floats, apply_homography, invert_homography
 
@@ -190,12 +189,3 @@ def test_held_centres_stay_and_rotations_follow() -> None:
     # The rotation takes up what it can of a wrong centre: a turn of 2 cm over 42 m, less towards the frame's edges.
     turn = Rotation.from_matrix(fit.R @ np.swapaxes(R, 1, 2)).magnitude()
     np.testing.assert_allclose(turn, 0.02 / 42, rtol=0.2)
-
-
-def test_robust_sigma_is_that_of_one_coordinate() -> None:
-    residual = np.random.default_rng(4).normal(scale=3e-4, size=(2, 4000, 2))
-    seen = np.ones((2, 4000), dtype=bool)
-    seen[1, 2000:] = False
-    residual[1, 2000:] = 1.0
-    np.testing.assert_allclose(robust_sigma(residual, seen), 3e-4, rtol=0.05)
-    assert robust_sigma(residual, np.zeros_like(seen)).tolist() == [0.0, 0.0]

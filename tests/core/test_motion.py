@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from core.coordinates import Floats, rotation_2d
 from core.motion import (
     LineSet,
-    biweight,
     fit_line,
     is_determined,
     is_determined_as_whole,
@@ -200,14 +199,6 @@ def test_wild_points_are_passed_over_and_none_is_no_motion() -> None:
     np.testing.assert_allclose(fit.shift[0], [0.3, -0.2], atol=6e-3 / np.sqrt(50))
     assert is_determined(fit.normal).tolist() == [True, False, False]
     assert np.isfinite(fit.shift).all()
-
-
-def test_biweight_falls_from_one_to_nothing() -> None:
-    weights = biweight(np.array([0.0, 1.0, 4.0, 4.7, -9.0, np.nan]), 1.0)
-    assert weights[0] == 1.0
-    assert 0.9 < weights[1] < 1.0
-    assert 0.0 < weights[2] < 0.1
-    assert weights[3:].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_a_glimpse_of_a_line_determines_nothing() -> None:
