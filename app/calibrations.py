@@ -11,7 +11,7 @@ from core.errors import InputError
 from core.lens import write_lens
 from core.lens_calibration import calibrate
 from core.progress import CancelToken, Progress
-from core.project import write_atomically
+from core.storage import write_atomically
 
 REPORT_FILE = "lens_report.json"
 _LENS_FILE = "lens-calibrated.yaml"

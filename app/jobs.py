@@ -24,7 +24,7 @@ from app.errors import Busy, Missing
 from app.events import Hub
 from app.store import ProjectFolder, read_json
 from core.errors import InputError
-from core.project import write_atomically
+from core.storage import write_atomically
 
 JOB_FILE = "job.json"
 State = Literal["running", "done", "failed", "cancelled", "interrupted"]

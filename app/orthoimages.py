@@ -16,7 +16,8 @@ from core.errors import InputError
 from core.orthoimage import make_orthoimage, read_geotiff, read_grid, write_geotiff
 from core.progress import CancelToken, Progress
 from core.project import Orthoimage as Settings
-from core.project import Project, read_project, write_atomically
+from core.project import Project, read_project
+from core.storage import write_atomically
 
 ORTHOIMAGE_FILE = "orthoimage.tif"
 _MADE_FROM = "orthoimage.made-from"

@@ -20,9 +20,10 @@ from app.store import CACHE_FOLDER, ProjectFolder, read_json
 from core.cloud import Cloud, GroundPlane, fit_ground_plane, read_cloud
 from core.errors import InputError
 from core.progress import CancelToken, Progress
-from core.project import Project, read_project, write_atomically
+from core.project import Project, read_project
 from core.relief import Relief
 from core.run import relief_plan
+from core.storage import write_atomically
 
 _FACTS = "cloud.json"
 _ARRAYS = ("points_m", "colour", "intensity")

@@ -24,7 +24,7 @@ from core.lens import Lens
 from core.measurements import Recording
 from core.motion import LineSet, fit_line
 from core.progress import Progress, silent
-from core.project import LINE_NAMES, Project, Target, write_atomically
+from core.project import LINE_NAMES, Project, Target
 from core.report import Correction, Fact, InputFile, ReportContent, ReportFigure, TargetReport, write_report
 from core.results import (
     CSV_HEADER,
@@ -37,7 +37,7 @@ from core.results import (
 from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution
 from core.solve import filtered, unfiltered_history
-from core.storage import File
+from core.storage import File, write_atomically
 from core.validation import GpsComparison, GpsRecord, compare_with_gps
 from core.video import read_frame
 

@@ -18,8 +18,7 @@ from numpy.typing import ArrayLike
 
 from core.coordinates import Floats, batches, read_only
 from core.errors import InputError
-from core.project import write_atomically
-from core.storage import File
+from core.storage import File, write_atomically
 
 # Newton's method doubles the number of right digits: after a step this small the ray is exact in float64.
 _LAST_STEP = 1e-9

@@ -19,7 +19,7 @@ from core.errors import InputError
 from core.lens import Lens
 from core.progress import Progress, silent
 from core.project import Orthoimage as Settings
-from core.project import write_atomically
+from core.storage import write_atomically
 
 Pixels = NDArray[np.uint8]
 Float32 = NDArray[np.float32]

@@ -7,7 +7,6 @@ Only the file's own consistency is checked here; whether the inputs fit together
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from core.errors import InputError
+from core.storage import write_atomically
 
 PROJECT_FILE = "project.json"
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -276,14 +276,3 @@ def project_json(project: Project) -> str:
     text = json.dumps(project.model_dump(mode="json"), indent=2, ensure_ascii=False)
     flat_list = re.compile(r"\[\s+((?:[^\[\]{}\"]|\"[^\"]*\")*?)\s+\]")
     return flat_list.sub(lambda found: "[" + re.sub(r"\s*\n\s*", " ", found.group(1)) + "]", text) + "\n"
-
-
-def write_atomically(file: Path, content: bytes) -> None:
-    """Replace a file's content in one step, durable before it takes the old one's place."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f".{file.name}.{os.getpid()}.part")
-    with part.open("wb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(part, file)

@@ -19,7 +19,7 @@ from scipy.ndimage import map_coordinates, maximum_filter
 from core.camera import Pose, intersect_height
 from core.cloud import PASS_POINTS, RELIEF_REACH_M, Cloud, GroundPlane, ground_elevation
 from core.coordinates import Bools, Floats, batches, read_only
-from core.project import write_atomically
+from core.storage import write_atomically
 
 CELL_M = 0.25
 # A site larger than this is rasterised more coarsely, so that it never takes longer than a few seconds.

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from core.georeference import PairResidual, ReferenceFit
-from core.project import Project, Target, write_atomically
+from core.project import Project, Target
 from core.self_calibration import SUSPICIOUS
+from core.storage import write_atomically
 from core.validation import GpsComparison
 
 REPORT_FILE = "report.html"

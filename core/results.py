@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from core.coordinates import Bools, Floats
 from core.errors import InputError
 from core.intervals import within
-from core.project import Intervals, write_atomically
+from core.project import Intervals
+from core.storage import write_atomically
 
 
 class Status(StrEnum):

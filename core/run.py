@@ -28,10 +28,10 @@ from core.measurements import MeasurementStore
 from core.orthoimage import make_orthoimage, write_geotiff
 from core.prediction import MeasureSetup
 from core.progress import CancelToken, Progress, silent
-from core.project import PROJECT_FILE, Project, read_project, write_atomically
+from core.project import PROJECT_FILE, Project, read_project
 from core.relief import Relief, rasterise
 from core.solve import solve
-from core.storage import File, content_identity, file_at, opened, state_of
+from core.storage import File, content_identity, file_at, opened, state_of, write_atomically
 from core.validation import GpsRecord, read_gps
 from core.video import VideoInfo, frame_index, probe
 

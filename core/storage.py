@@ -8,6 +8,8 @@ project.
 from __future__ import annotations
 
 import hashlib
+import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -149,3 +151,19 @@ def _said_plainly(file: FarFile) -> Iterator[None]:
         raise InputError(
             f"{file}: cannot be read ({type(error).__name__}: {error}); see that this machine may read it."
         ) from None
+
+
+def write_atomically(file: Path, content: bytes) -> None:
+    """Replace a file's content in one step, durable before it takes the old one's place."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    # Two threads may write the same file.
+    part = file.with_name(f".{file.name}.{secrets.token_hex(4)}.part")
+    try:
+        with part.open("wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        part.replace(file)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise

@@ -1,5 +1,6 @@
 """Files under addresses, read from storage that fsspec knows; one of them tells what was fetched."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from fsspec.spec import AbstractBufferedFile, AbstractFileSystem
 
 from core import storage
 from core.errors import InputError
-from core.storage import FarFile, content_identity, file_at, opened, state_of
+from core.storage import FarFile, content_identity, file_at, opened, state_of, write_atomically
 from core.video import frame_index, probe, read_frame, read_frames
 from tests.core.test_video import FRAMES, number_of, write
 
@@ -168,3 +169,22 @@ def test_frames_far_away_have_their_own_times(tmp_path, bucket):
     near = write(tmp_path / "uneven.mp4", frames=40, ticks=ticks)
     times = [frame.time_s for frame in read_frames(FarFile(f"bucket://{near}"), 30)]
     np.testing.assert_allclose(times, (np.array(ticks[30:]) - ticks[0]) / 1000, atol=1e-9)
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_that_cannot_be_written_stays_as_it_was_and_leaves_no_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "deep" / "file.json"
+    write_atomically(file, b"old")
+
+    def no_room(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", no_room)
+    with pytest.raises(OSError, match="No space left"):
+        write_atomically(file, b"new")
+    assert file.read_bytes() == b"old"
+    assert [each.name for each in file.parent.iterdir()] == ["file.json"]
