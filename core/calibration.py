@@ -97,27 +97,32 @@ class Evidence:
         return cls(recording, speed, project, start, reference, relief, ground)
 
     @cached_property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """What may be corrected; in the order of all corrections (P,)."""
+    def _groups(self) -> dict[str, tuple[Parameter, ...]]:
+        """What may be corrected, by what it is part of, in the order of all corrections (P,)."""
         lens = self.start.lens
         sigma, (fx, fy), (cx, cy), (k1, k2) = lens.sigma, lens.focal_px, lens.centre_px, lens.distortion[:2]
-        return (
-            Parameter("fx", "px", sigma.focal_relative * fx, fx),
-            Parameter("fy", "px", sigma.focal_relative * fy, fy),
-            Parameter("cx", "px", sigma.centre_px, cx),
-            Parameter("cy", "px", sigma.centre_px, cy),
-            Parameter("k1", "1", sigma.k1, k1),
-            Parameter("k2", "1", sigma.k2, k2),
-            *(
+        return {
+            "focal_px": (
+                Parameter("fx", "px", sigma.focal_relative * fx, fx),
+                Parameter("fy", "px", sigma.focal_relative * fy, fy),
+            ),
+            "centre_px": (Parameter("cx", "px", sigma.centre_px, cx), Parameter("cy", "px", sigma.centre_px, cy)),
+            "radial": (Parameter("k1", "1", sigma.k1, k1), Parameter("k2", "1", sigma.k2, k2)),
+            "heights_m": tuple(
                 Parameter(f"height of {name}", "m", HEIGHT_SIGMA_M, height)
                 for name, height in self.start.heights_m.items()
             ),
-            *(
+            "shift_m": tuple(
                 Parameter(f"{axis} of the reference camera", "m", max(float(shift), 1e-6), float(centre))
                 for axis, shift, centre in zip("xy", self._centre_sigma_m, self._centre_m, strict=False)
             ),
-            Parameter(LAG, "s", self._lag_sigma_s),
-        )
+            "lag_s": (Parameter(LAG, "s", self._lag_sigma_s),),
+        }
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What may be corrected; in the order of all corrections (P,)."""
+        return tuple(parameter for group in self._groups.values() for parameter in group)
 
     @cached_property
     def _elevation(self) -> Floats | None:
@@ -143,18 +148,21 @@ class Evidence:
     def corrected(self, correction: Floats) -> Calibration:
         """Return the calibration with a correction (P,); the reference pose follows from lens and clicks."""
         start = self.start
+        ends = np.cumsum([len(group) for group in self._groups.values()])
+        by = dict(zip(self._groups, np.split(correction, ends[:-1]), strict=True))
         K, d = start.lens.camera_matrix.copy(), start.lens.distortion.copy()
-        K[[0, 1, 0, 1], [0, 1, 2, 2]] += correction[:4]
-        d[:2] += correction[4:6]
+        K[[0, 1], [0, 1]] += by["focal_px"]
+        K[:2, 2] += by["centre_px"]
+        d[:2] += by["radial"]
         heights = {
-            target.name: start.heights_m[target.name] + float(extra)
-            for target, extra in zip(self.project.targets, correction[6:-3], strict=True)
+            name: height + float(extra)
+            for (name, height), extra in zip(start.heights_m.items(), by["heights_m"], strict=True)
         }
         lens = replace(start.lens, camera_matrix=K, distortion=d)
-        shift = start.shift_m + np.append(correction[-3:-1], 0.0)
+        shift = start.shift_m + np.append(by["shift_m"], 0.0)
         clicks = self.project.correspondences
         pose0 = reference_pose(clicks, lens, self.reference.origin_m, self._elevation, shift)
-        return Calibration(lens, pose0, heights, start.lag_s + float(correction[-1]), shift)
+        return Calibration(lens, pose0, heights, start.lag_s + float(by["lag_s"][0]), shift)
 
 
 def calibrate(evidence: Evidence) -> SelfCalibration:
@@ -227,7 +235,7 @@ class _Trials:
         chosen = np.array([int(group[len(group) // 2]) for group in groups])
         self._evidence = evidence
         self._frames = evidence.recording.selected(chosen)
-        self._speed = np.nan_to_num(np.stack([_mean_seen(evidence.speed[group]) for group in groups]))
+        self._speed = np.nan_to_num(np.stack([_mean_over_frames(evidence.speed[group]) for group in groups]))
         self._start = evidence.ground.known_poses.selected(chosen)
         self._weight = {target.name: self._target_weight(target) for target in evidence.project.targets}
 
@@ -273,7 +281,7 @@ def target_motion(evidence: Evidence, groups: Sequence[NDArray[np.int64]]) -> Ca
     every = _Trials(evidence, [np.array([frame]) for group in groups for frame in group])
     by_frame = every.motion(np.zeros(len(evidence.parameters)))
     ends = np.cumsum([len(group) for group in groups])
-    mean = np.stack([_mean_seen(rows) for rows in np.split(by_frame, ends[:-1])])
+    mean = np.stack([_mean_over_frames(rows) for rows in np.split(by_frame, ends[:-1])])
     return lambda correction: mean + trials.motion(correction) - single
 
 
@@ -284,7 +292,7 @@ def ground_misfit(evidence: Evidence) -> Callable[[Floats], Floats]:
     weight = np.stack([evidence.ground.known_poses.weight[group].mean(axis=0) for group in groups])
     agree = np.stack([(evidence.ground.weight[group] > 0.1).mean(axis=0) > 0.5 for group in groups])
     residual = np.where(evidence.ground.weight[..., None] > 0.1, evidence.ground.known_poses.residual, np.nan)
-    mean = np.stack([_mean_seen(residual[group]) for group in groups])
+    mean = np.stack([_mean_over_frames(residual[group]) for group in groups])
     agree &= finite_rows(mean)
     single = trials.attempt(np.zeros(len(evidence.parameters))).poses.residual
 
@@ -360,7 +368,7 @@ def _sigma_from_rest(J: Floats, covariance: Floats, still: Bools, moments_s: Flo
     return np.stack(columns, axis=1).reshape(len(time_s), 2, 2)
 
 
-def _mean_seen(values: Floats) -> Floats:
+def _mean_over_frames(values: Floats) -> Floats:
     """Return the mean along the first axis of what is finite; nan where nothing is."""
     count = np.isfinite(values).sum(axis=0)
     return np.asarray(np.where(count > 0, np.nansum(values, axis=0) / np.maximum(count, 1), np.nan))

@@ -1,7 +1,7 @@
 """What a solve found out, written for people: histories as CSV, the summary, figures and the report.
 
-Everything is computed before the first file is touched, so that a refusal leaves earlier results as they were; each
-file takes its predecessor's place in one step, the summary last.
+All that may be refused is computed before the first file is touched, so that a refusal leaves earlier results as they
+were; each file takes its predecessor's place in one step, the summary last.
 """
 
 from __future__ import annotations

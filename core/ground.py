@@ -24,8 +24,9 @@ from core.video import Luma
 FEATURES = 180
 # Correlation from which two noisy views are alike by more than chance.
 ALIKE_SCORE = 0.15
-# In noise patches stay near where they are looked for: so many times they are looked for where they have been found, so
-# that nothing is left of the prediction and a chunk measured by itself equals an uninterrupted pass.
+# With a noisy reference the search for a patch stops short of its place and stays near where it began. Repeated this
+# often, each time from where it ended, it no longer depends on where it began, and a chunk measured by itself equals an
+# uninterrupted pass.
 NOISY_ROUNDS = 2
 # Where a prediction is no further off than this, every patch comes home from it; from further off in a few rounds.
 NEAR_PX = 1.5

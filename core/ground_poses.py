@@ -29,9 +29,10 @@ STANDING_ROUNDS = 4
 TRUST_FRAMES = 1000
 # Least scatter of ground points at which outliers are told, pixels.
 LEAST_SIGMA_PX = 0.01
-# A starved encoder repeats the ground of a key frame in the frames that follow, while strips go on moving. Where
-# features usually scatter by more than the first, pixels, a frame shows a repetition and no view of its own if their
-# scatter, and how much it differs from the frame before, are both below this part of what is usual.
+# An encoder short of bits repeats the ground of a key frame in the frames that follow, while strips go on moving. It is
+# looked for where features usually scatter by more than COARSE_PX, pixels. A frame repeats another if its features
+# scatter less than this part of what is usual, and have moved against each other since the frame before by less than
+# this part of what is usual.
 COARSE_PX = 0.15
 REPEATED = 0.45
 

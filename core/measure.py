@@ -246,7 +246,7 @@ def measure(
             source = helpers.measure(orders, own)
         else:
             source = cluster.measure(eyes, lambda parts: missing_chunks(done, index, parts), len(index))
-        _take_over(source, store, recording, len(done), len(index), progress, cancel)
+        _take_over(source, store, recording, done=len(done), total=len(index), progress=progress, cancel=cancel)
     store.finish(recording)
     return recording
 
@@ -255,6 +255,7 @@ def _take_over(
     source: Generator[FrameMeasurement, None, None],
     store: MeasurementStore,
     recording: int,
+    *,
     done: int,
     total: int,
     progress: Progress,

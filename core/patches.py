@@ -38,7 +38,8 @@ SETTLED_PX = 0.06
 MAX_WANDER_PX = 5.0
 # Correlation below which a patch shows something else than in the reference frame.
 LEAST_SCORE = 0.6
-# An encoder copies some of a frame's noise into its neighbours: so many views lie between two means in neither of them.
+# An encoder copies some of a frame's noise into its neighbours, so this many views between the two halves are in
+# neither mean.
 VIEWS_BETWEEN = 4
 
 
@@ -132,7 +133,7 @@ class PatchTracker:
         likeness = np.nanmedian([_correlation(reference, view) for view in views])
         # Two noisy views are as alike as the square of what a noisy one and one without noise are.
         self.least_score = LEAST_SCORE * float(np.sqrt(np.clip(likeness, 0.0, 1.0)))
-        self._tiles = _mean_seen(first, reference), _mean_seen(second, reference)
+        self._tiles = _mean_of_views(first, reference), _mean_of_views(second, reference)
         self._lay_out()
 
     def track(self, luma: Luma, predicted_raw: Floats, ref_from_current: Floats, *, is_view: bool = False) -> Matches:
@@ -228,7 +229,7 @@ def _oversampled(tiles: NDArray[Any], corner: NDArray[np.int64]) -> Singles:
     return mosaic
 
 
-def _mean_seen(views: Sequence[Singles], otherwise: Singles) -> Singles:
+def _mean_of_views(views: Sequence[Singles], otherwise: Singles) -> Singles:
     """Return the mean (N, size, size) of views in which a tile is seen, or else another tile."""
     stack = np.stack(views)
     seen = np.isfinite(stack[:, :, 0, 0]).sum(axis=0)[:, None, None]

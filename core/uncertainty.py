@@ -56,7 +56,7 @@ def common_error(residual: Floats, time_s: Floats, still: Bools) -> Floats:
     usual = still if still.sum() >= LEAST_STILL else np.ones(frames, dtype=bool)
     own = residual - finite_median(np.moveaxis(np.where(usual[:, None, None], residual, np.nan), 0, -1))
     if count % PIECES == 0:
-        own = _mean_seen(own.reshape(frames, rows, PIECES, count // PIECES))
+        own = _mean_where_mostly_seen(own.reshape(frames, rows, PIECES, count // PIECES))
     square = finite_median(np.abs(own).reshape(frames, -1)) ** 2
     window = max(1, round(AVERAGED_S / float(np.median(np.diff(time_s))))) if frames > 1 else 1
     wandering = BY_MEDIAN * np.sqrt(uniform_filter1d(square, window, mode="nearest"))
@@ -64,7 +64,7 @@ def common_error(residual: Floats, time_s: Floats, still: Bools) -> Floats:
     return np.asarray(at_rest * np.maximum(wandering / at_rest, LEAST_WANDERING) ** GROWTH)
 
 
-def _mean_seen(values: Floats) -> Floats:
+def _mean_where_mostly_seen(values: Floats) -> Floats:
     """Return the mean along the last axis where at least half is finite, else nan."""
     count = np.isfinite(values).sum(axis=-1)
     mean = np.nansum(values, axis=-1) / np.maximum(count, 1)
