@@ -18,8 +18,10 @@ from core.errors import InputError
 from core.storage import write_atomically
 
 PROJECT_FILE = "project.json"
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+# Strict: neither "18.3" nor true is a number.
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
+Whole = Annotated[int, Field(strict=True)]
 Point = tuple[Finite, Finite]
 Interval = tuple[Finite, Finite]
 Method = Literal["geometric", "paper"]
@@ -70,7 +72,7 @@ class Orthoimage(Model):
 class Correspondence(Model):
     """One clicked pair: a place on the ground (world metres) and in the raw reference frame (pixels)."""
 
-    id: int
+    id: Whole
     ground_m: Point
     frame_px: Point
     enabled: bool = True
@@ -137,7 +139,7 @@ class Drift(Model):
     """High-pass filter of the paper; none where geometry has removed the drift."""
 
     filter: Literal["none", "high-pass"] = "none"
-    order: Annotated[int, Field(ge=1, le=20)] = 10
+    order: Annotated[Whole, Field(ge=1, le=20)] = 10
     corner_hz: Positive = 0.25
 
 
@@ -148,11 +150,11 @@ class Project(Model):
     name: Annotated[str, Field(min_length=1)]
     inputs: Inputs
     orthoimage: Orthoimage = Orthoimage()
-    reference_frame: Annotated[int, Field(ge=0)] = 0
+    reference_frame: Annotated[Whole, Field(ge=0)] = 0
     correspondences: tuple[Correspondence, ...] = ()
     moving_regions_px: tuple[tuple[Point, ...], ...] = ()
     targets: tuple[Target, ...] = ()
-    excluded_frames: tuple[tuple[int, int], ...] = ()
+    excluded_frames: tuple[tuple[Whole, Whole], ...] = ()
     intervals_s: Intervals = Intervals()
     method: Method = "geometric"
     drift: Drift = Drift()
@@ -173,7 +175,7 @@ class Project(Model):
 
     @field_validator("excluded_frames")
     @classmethod
-    def _ranges_ordered(cls, ranges: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
+    def _ranges_ordered(cls, ranges: tuple[tuple[Whole, Whole], ...]) -> tuple[tuple[Whole, Whole], ...]:
         for first, last in ranges:
             if not 0 <= first <= last:
                 raise ValueError(f"[{first}, {last}] must be [first, last] with 0 <= first <= last")
@@ -230,7 +232,7 @@ def parse_project(text: str, file: Path | str = PROJECT_FILE) -> Project:
         InputError: with every problem and its path in the file.
     """
     try:
-        document = json.loads(text)
+        document = json.loads(text, object_pairs_hook=lambda pairs: _without_repetition(pairs, file))
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
         raise InputError(f"{file}: {place} is not valid JSON ({error.msg}); correct it there.") from None
@@ -238,6 +240,16 @@ def parse_project(text: str, file: Path | str = PROJECT_FILE) -> Project:
     if problems:
         raise InputError(f"{file}: " + "; ".join(problems) + ".")
     return Project.model_validate(document)
+
+
+def _without_repetition(pairs: list[tuple[str, Any]], file: Path | str) -> dict[str, Any]:
+    """Return an object of the file; JSON would take the last of two values of one key without a word."""
+    document = dict(pairs)
+    if len(document) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise InputError(f'{file}: the key "{twice}" stands twice in one place; remove one of them.')
+    return document
 
 
 def project_problems(document: Any) -> list[str]:
@@ -250,6 +262,8 @@ def project_problems(document: Any) -> list[str]:
 
 
 def _sentence(location: tuple[int | str, ...], kind: str, message: str, value: object) -> str:
+    if not location and kind == "model_type":
+        return "holds no project, which is an object with name, inputs and more; restore it from a copy"
     path = re.sub(r"\.\[", "[", ".".join(f"[{part}]" if isinstance(part, int) else part for part in location)) or "top"
     if kind == "extra_forbidden":
         return f'{path}: unknown key "{location[-1]}", remove it or correct its spelling'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,8 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
             put(20, "targets", 0, "height_m"),
             "height_m: 20, but by the clicks the camera hovers 15.0 m above",
         ),
+        (put("3.0", "targets", 0, "height_m"), 'targets[0].height_m: input should be a valid number, not "3.0"'),
+        (put(True, "reference_frame"), "reference_frame: input should be a valid integer, not true"),
         (put(3, "wind"), 'wind: unknown key "wind"'),
     ],
 )
@@ -142,11 +145,21 @@ def test_paper_needs_lines_and_their_scale(inputs: Path) -> None:
     assert 'targets[0].kind: "points", which method "paper" does not know' in line
 
 
-@pytest.mark.parametrize(("text", "told"), [("{", "line 1, column 2 is not valid JSON"), ("[]", "project.json: top:")])
+@pytest.mark.parametrize(
+    ("text", "told"), [("{", "line 1, column 2 is not valid JSON"), ("[]", "project.json: holds no project")]
+)
 def test_a_file_that_is_no_project(tmp_path: Path, text: str, told: str) -> None:
     (tmp_path / "project.json").write_text(text, encoding="utf-8")
     (line,) = check_project(tmp_path)
     assert told in line
+
+
+def test_a_key_that_stands_twice(inputs: Path) -> None:
+    file = inputs / "project.json"
+    text = json.dumps(small_project.document())
+    file.write_text(text.replace('"height_m": 3.0', '"height_m": 3.0, "height_m": 4.0'))
+    (line,) = check_project(inputs)
+    assert 'the key "height_m" stands twice in one place; remove one of them' in line
 
 
 def test_a_folder_without_project(tmp_path: Path) -> None:
