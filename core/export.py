@@ -344,7 +344,7 @@ def _tracked_figure(results: Results, target: Target, luma: NDArray[np.uint8]) -
         corners = solution.reference.raw_from_plan(np.array(target.region_m))
         lines = {"region": np.vstack([corners, corners[:1]])}
         edges = {"region": measured}
-        points = _points_of_region(solution, target)
+        points = _points_of_region(solution, target, results.project.reference_frame)
     else:
         lines, points = fitted_lines(measured, solution.lens)
         edges = {name: edge.reshape(-1, 2) for name, edge in zip(LINE_NAMES, measured, strict=True)}
@@ -379,12 +379,15 @@ def fitted_lines(edges_raw: Floats, lens: Lens) -> tuple[dict[str, Floats], dict
     return drawn, {name: lens.raw_from_rays(crossing) for name, crossing in crossings.items()}
 
 
-def _points_of_region(solution: Solution, target: Target) -> dict[str, Floats]:
+def _points_of_region(solution: Solution, target: Target, reference_frame: int) -> dict[str, Floats]:
     """Return P1 and P2 of a points target in raw pixels of the reference frame, where its height is known."""
     pose, height = solution.reference.pose, solution.heights_m[target.name]
     if pose is None or height is None:
         return {}
-    places = solution.targets[target.name].rest_m - solution.reference.origin_m
+    solved = solution.targets[target.name]
+    shown = solved.history.frame == reference_frame
+    moved = np.stack([np.nan_to_num(each[shown]).sum(axis=0) for each in (solved.history.p1_m, solved.history.p2_m)])
+    places = solved.rest_m + moved - solution.reference.origin_m
     rays = project(pose.R, pose.centre_m, np.column_stack([places, np.full(2, height)]))
     return dict(zip(("P1", "P2"), solution.lens.raw_from_rays(rays), strict=True))
 

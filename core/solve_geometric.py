@@ -14,7 +14,7 @@ import numpy as np
 from core.bodies import RestBody, midpoints, rest_body, world_points
 from core.calibration import Calibration, Evidence, calibrate, calibration_sigma
 from core.camera import Pose, fit_poses, plan_homographies
-from core.coordinates import Bools, Floats, evenly_spread
+from core.coordinates import Floats, evenly_spread
 from core.errors import InputError
 from core.flight import SmoothFlight, smooth_flight
 from core.georeference import ReferenceFit
@@ -200,13 +200,16 @@ def _solve_target(
     raw = flat.fit(apparent, np.zeros(len(apparent), dtype=bool))
     scale = _paper_scale(target, flat, used.pose0, height)
     measured = (status == Status.OK) | (status == Status.WEAK)
-    places, rotation = _from_rest(
-        np.stack([fit.at(place, body.centre) for place in body.places], 1), fit.rotation_rad, still & measured
+    moved = np.stack([fit.at(place, body.centre) for place in body.places], axis=1)
+    at_rest = still & measured
+    start_m, start_rad = (
+        (moved[at_rest].mean(axis=0), fit.rotation_rad[at_rest].mean()) if at_rest.any() else (np.zeros((2, 2)), 0.0)
     )
+    places, rotation = moved - start_m, fit.rotation_rad - start_rad
     part = height / used.pose0.centre_m[2]
     pixel_m = (used.pose0.centre_m[2] - height) / float(used.lens.focal_px.mean())
     frames = len(recording.frame)
-    common_m = common_error(fit.residual, recording.time_s, still & measured)
+    common_m = common_error(fit.residual, recording.time_s, at_rest)
     sigma = combined_sigma(
         _sigma_of_points(fit, body),
         camera_m=np.zeros((frames, 2)) if flight is None else part * flight.sigma_m[:, :2],
@@ -214,7 +217,7 @@ def _solve_target(
         slow_m=slow_m,
         places_m=places,
         rotation_rad=rotation,
-        still=still & measured,
+        still=at_rest,
         moving=~(still | during(recording.time_s, project.intervals_s.residual)),
     )
     history = TargetHistory(
@@ -232,7 +235,7 @@ def _solve_target(
         p2_raw_m=scale * raw.at(flat.places[1], flat.centre),
         rotation_raw_rad=raw.rotation_rad,
     )
-    return TargetSolution(history=history, rest_m=body.places + origin_m)
+    return TargetSolution(history=history, rest_m=body.places + start_m + origin_m)
 
 
 def _paper_scale(target: Target, flat: RestBody, pose0: Pose, height_m: float) -> float:
@@ -240,13 +243,6 @@ def _paper_scale(target: Target, flat: RestBody, pose0: Pose, height_m: float) -
     if target.p1_p2_m is not None and target.kind == "lines":
         return target.p1_p2_m / float(np.linalg.norm(flat.places[0] - flat.places[1]))
     return float((pose0.centre_m[2] - height_m) / pose0.centre_m[2])
-
-
-def _from_rest(places: Floats, rotation_rad: Floats, still: Bools) -> tuple[Floats, Floats]:
-    """Return displacements (F, 2, 2) and rotations (F,) from their mean in the stationary part, where there is one."""
-    if not still.any():
-        return places, rotation_rad
-    return places - places[still].mean(axis=0), rotation_rad - rotation_rad[still].mean()
 
 
 def _sigma_of_points(fit: RigidFit, body: RestBody) -> Sigma:

@@ -90,10 +90,13 @@ def on_roof(frame: float) -> Floats:
     return np.concatenate([places, np.full((*places.shape[:-1], 1), HEIGHT_M)], axis=-1)
 
 
+# Where ground clicks are made, metres from the site's middle.
+CLICKS = [(-22, -11), (-8, -12), (9, -11.5), (22, -12), (21, 0), (22, 11), (7, 12), (-9, 11), (-23, 12), (-21, 1)]
+
+
 def project_document(**changes: Any) -> Project:
     """Return the project a careful person would have made."""
-    clicks = [(-22, -11), (-8, -12), (9, -11.5), (22, -12), (21, 0), (22, 11), (7, 12), (-9, 11), (-23, 12), (-21, 1)]
-    places = np.array(clicks, dtype=float)
+    places = np.array(CLICKS, dtype=float)
     pixels = seen(0, np.column_stack([places, np.zeros(len(places))]))
     bands = {
         name: {"from_m": (np.array(a) + ROOF_M + SITE_M).tolist(), "to_m": (np.array(b) + ROOF_M + SITE_M).tolist()}

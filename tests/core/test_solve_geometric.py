@@ -83,6 +83,23 @@ def test_residual_displacement_stays() -> None:
     np.testing.assert_allclose(rest, [scene.RESIDUAL_M, 0.0], atol=1.5e-3)
 
 
+def test_rest_is_where_points_lie_before_the_event_whatever_the_reference_frame_shows() -> None:
+    recording = scene.recording()
+    shaken = int(np.argmax(np.abs(scene.truth().p1_m[:, 0])))
+    ground, roof = recording.ground_raw[shaken], recording.targets_raw["roof"][shaken]
+    assert np.abs(scene.truth().p1_m[shaken, 0]) > 0.05
+    still = solved(recording).targets["roof"].rest_m
+    later = replace(recording, reference=replace(recording.reference, ground_raw=ground, targets_raw={"roof": roof}))
+    pixels = scene.seen(shaken, np.column_stack([np.array(scene.CLICKS, dtype=float), np.zeros(len(scene.CLICKS))]))
+    pairs = [
+        pair.model_copy(update={"frame_px": tuple(pixel)})
+        for pair, pixel in zip(scene.project_document().correspondences, pixels.tolist(), strict=True)
+    ]
+    solution = solved(later, reference_frame=shaken, correspondences=pairs)
+    np.testing.assert_allclose(solution.targets["roof"].rest_m, still, atol=2e-3)
+    assert rms_mm(solution.histories["roof"]) < 0.1
+
+
 def test_a_textured_roof_seen_roughly_is_measured_with_a_larger_standard_deviation() -> None:
     lines = scene.recording(0.02)
     patches = lines.targets_raw["roof"].reshape(scene.FRAMES, -1, 2)
