@@ -16,9 +16,9 @@ from pathlib import Path, PurePosixPath
 from app.errors import Invalid
 from app.history import DAMAGED_FILE, HISTORY_FILE
 from app.jobs import JOB_FILE
-from app.store import CACHE_FOLDER, RESULTS_FOLDER, ProjectFolder, Workspace, stored_inputs, with_inputs
+from app.store import CACHE_FOLDER, ProjectFolder, Workspace, stored_inputs, with_inputs
 from app.uploads import SPARE_BYTES
-from core.project import PROJECT_FILE, Project, parse_project, project_json, write_project
+from core.project import PROJECT_FILE, RESULTS_FOLDER, Project, parse_project, project_json, write_project
 
 INPUTS_FOLDER = "inputs"
 

@@ -11,6 +11,7 @@ from core.errors import InputError
 from core.lens import write_lens
 from core.lens_calibration import calibrate
 from core.progress import CancelToken, Progress
+from core.project import RESULTS_FOLDER
 from core.storage import write_atomically
 
 REPORT_FILE = "lens_report.json"
@@ -40,6 +41,6 @@ def calibrate_lens(folder: Path, order: dict[str, Any], progress: Progress, canc
         files, board=board_of(order["board"]), square_m=float(order["square_m"]), progress=progress, cancel=cancel
     )
     facts = found.facts() | {"files": order["files"], "lens_file": _LENS_FILE, "report": found.report()}
-    write_atomically(folder / "results" / REPORT_FILE, json.dumps(facts).encode())
+    write_atomically(folder / RESULTS_FOLDER / REPORT_FILE, json.dumps(facts).encode())
     write_lens(folder / _LENS_FILE, found.lens)
     return {"file": _LENS_FILE, "rms_px": found.lens.rms_px}

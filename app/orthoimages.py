@@ -15,8 +15,8 @@ from core.coordinates import OrthoGrid
 from core.errors import InputError
 from core.orthoimage import make_orthoimage, read_geotiff, read_grid, write_geotiff
 from core.progress import CancelToken, Progress
+from core.project import RESULTS_FOLDER, Project, read_project
 from core.project import Orthoimage as Settings
-from core.project import Project, read_project
 from core.storage import write_atomically
 
 ORTHOIMAGE_FILE = "orthoimage.tif"
@@ -118,7 +118,7 @@ def build(folder: Path, order: dict[str, Any], progress: Progress, cancel: Cance
     cancel.raise_if_cancelled()
     ortho = make_orthoimage(site.cloud, site.plane, project.orthoimage, progress)
     cancel.raise_if_cancelled()
-    file = folder / "results" / ORTHOIMAGE_FILE
+    file = folder / RESULTS_FOLDER / ORTHOIMAGE_FILE
     write_geotiff(file, ortho)
     made_from = _origin(identity(Path(order["cloud"])), project.orthoimage)
     write_atomically(file.with_name(_MADE_FROM), made_from.encode())
@@ -130,5 +130,5 @@ def build(folder: Path, order: dict[str, Any], progress: Progress, cancel: Cance
         "fill_limit_m": ortho.fill_limit_m,
         "notes": list(ortho.notes),
     }
-    write_atomically(folder / "results" / CACHE_FOLDER / _NOTE, json.dumps(note).encode())
+    write_atomically(folder / RESULTS_FOLDER / CACHE_FOLDER / _NOTE, json.dumps(note).encode())
     return {"grid": vars(ortho.grid)}

@@ -20,7 +20,7 @@ from app.store import CACHE_FOLDER, ProjectFolder, read_json
 from core.cloud import Cloud, GroundPlane, fit_ground_plane, read_cloud
 from core.errors import InputError
 from core.progress import CancelToken, Progress
-from core.project import Project, read_project
+from core.project import RESULTS_FOLDER, Project, read_project
 from core.relief import Relief
 from core.run import relief_plan
 from core.storage import write_atomically
@@ -157,7 +157,7 @@ def read_site(folder: Path, order: dict[str, Any], progress: Progress, cancel: C
     Raises:
         InputError: the cloud cannot be used; that is kept too.
     """
-    cache, path, key = folder / "results" / CACHE_FOLDER, Path(order["cloud"]), str(order["key"])
+    cache, path, key = folder / RESULTS_FOLDER / CACHE_FOLDER, Path(order["cloud"]), str(order["key"])
     cache.mkdir(parents=True, exist_ok=True)
     try:
         cloud = _cached_cloud(cache, path, progress)

@@ -21,6 +21,7 @@ from app.places import Places
 from core.errors import InputError
 from core.project import (
     PROJECT_FILE,
+    RESULTS_FOLDER,
     GpsInput,
     Inputs,
     Project,
@@ -33,7 +34,6 @@ from core.storage import FarFile, File, file_at
 
 _AnyFile = TypeVar("_AnyFile", bound=File)
 
-RESULTS_FOLDER = "results"
 CACHE_FOLDER = "cache"
 TRASH_FOLDER = ".trash"
 CHECKERBOARD_FOLDER = "checkerboard"

@@ -20,7 +20,17 @@ from core.georeference import ReferenceFit, fit_reference
 from core.intervals import within
 from core.lens import Lens, read_lens, require_image_size
 from core.progress import Progress, silent
-from core.project import LINE_NAMES, PROJECT_FILE, Band, Lines, Project, Target, project_problems, read_project
+from core.project import (
+    LINE_NAMES,
+    PROJECT_FILE,
+    Band,
+    Lines,
+    Project,
+    Target,
+    naming_file,
+    project_problems,
+    read_project,
+)
 from core.storage import File, file_at
 from core.validation import read_gps
 from core.video import FrameIndex, VideoInfo, frame_index, probe
@@ -145,7 +155,8 @@ def _read_inputs(
 ) -> _Inputs:
     def tried(read: Callable[..., Result], *arguments: object) -> Result | None:
         try:
-            return read(*arguments)
+            with naming_file(folder):
+                return read(*arguments)
         except InputError as error:
             problems.append(str(error))
             return None

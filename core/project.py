@@ -7,8 +7,10 @@ Only the file's own consistency is checked here; whether the inputs fit together
 from __future__ import annotations
 
 import json
+import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,6 +20,7 @@ from core.errors import InputError
 from core.storage import write_atomically
 
 PROJECT_FILE = "project.json"
+RESULTS_FOLDER = "results"
 # Strict: neither "18.3" nor true is a number.
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
@@ -240,6 +243,17 @@ def parse_project(text: str, file: Path | str = PROJECT_FILE) -> Project:
     if problems:
         raise InputError(f"{file}: " + "; ".join(problems) + ".")
     return Project.model_validate(document)
+
+
+@contextmanager
+def naming_file(folder: Path) -> Iterator[None]:
+    """Have mistakes found in `project.json`, wherever they are found, name the file with its folder."""
+    try:
+        yield
+    except InputError as error:
+        if str(error).startswith(f"{PROJECT_FILE}: "):
+            raise InputError(f"{folder}{os.sep}{error}") from None
+        raise
 
 
 def _without_repetition(pairs: list[tuple[str, Any]], file: Path | str) -> dict[str, Any]:

@@ -24,11 +24,11 @@ from core.ground_poses import fit_with_relief
 from core.lens import Lens, read_lens, require_image_size
 from core.locks import take_lock
 from core.measure import measure
-from core.measurements import MeasurementStore
+from core.measurements import MeasurementStore, Recording
 from core.orthoimage import make_orthoimage, write_geotiff
 from core.prediction import MeasureSetup
 from core.progress import CancelToken, Progress, silent
-from core.project import PROJECT_FILE, Project, read_project
+from core.project import PROJECT_FILE, RESULTS_FOLDER, Project, naming_file, read_project
 from core.relief import Relief, rasterise
 from core.solve import solve
 from core.storage import File, content_identity, file_at, opened, state_of, write_atomically
@@ -114,44 +114,47 @@ def run_project(
         InputError: with the first thing that keeps the project from being measured; earlier results stay as they were.
         Cancelled: on request; what was measured stays and the next run goes on from there.
     """
-    inputs = load_inputs(folder, progress)
-    _require_runnable(inputs)
-    started = time.perf_counter()
-    results = folder / "results"
-    with _only_writer(results), MeasurementStore(results / FRAMES_FILE) as store:
-        setup = inputs.setup()
-        before = _frames_known(store, setup)
-        recording_id = measure(
-            setup, store, workers=workers, scheduler=scheduler, fresh=fresh, progress=progress, cancel=cancel
+    with naming_file(folder):
+        inputs = load_inputs(folder, progress)
+        _require_runnable(inputs)
+        started = time.perf_counter()
+        recording, known = _recorded(
+            inputs, fresh, workers=workers, scheduler=scheduler, progress=progress, cancel=cancel
         )
-        recording = store.load(recording_id)
-    measured_s = time.perf_counter() - started
-    progress("solving", 0, 1)
-    solving = time.perf_counter()
-    solution = solve(recording, inputs.project, inputs.lens, inputs.relief, has_lens=inputs.has_lens)
-    solved_s = time.perf_counter() - solving
-    progress("solving", 1, 1)
-    new = len(recording.frame) - (0 if fresh else before)
-    _write_orthoimage(inputs, progress)
-    summary = write_results(
-        results,
-        Results(
+        measured_s = time.perf_counter() - started
+        progress("solving", 0, 1)
+        solving = time.perf_counter()
+        solution = solve(recording, inputs.project, inputs.lens, inputs.relief, has_lens=inputs.has_lens)
+        solved_s = time.perf_counter() - solving
+        progress("solving", 1, 1)
+        _write_orthoimage(inputs, progress)
+        files = {file: file_at(folder, file) for file in input_files(inputs.project)}
+        results = Results(
             project=inputs.project,
             folder=folder,
             recording=recording,
             solution=solution,
             gps=inputs.gps,
             video=inputs.video,
-            sha256={file: sha256_of(file_at(folder, file), results) for file in input_files(inputs.project)},
-            identity={file: content_identity(file_at(folder, file)) for file in input_files(inputs.project)},
+            sha256={name: sha256_of(file, folder / RESULTS_FOLDER) for name, file in files.items()},
+            identity={name: content_identity(file) for name, file in files.items()},
             version=program_version(),
-            frames_measured=new,
+            frames_measured=len(recording.frame) - known,
             measuring_s=measured_s,
             solving_s=solved_s,
-        ),
-        progress,
-    )
-    return RunSummary(folder, len(recording.frame), new, measured_s, solved_s, summary)
+        )
+        summary = write_results(folder / RESULTS_FOLDER, results, progress)
+        return RunSummary(folder, len(recording.frame), results.frames_measured, measured_s, solved_s, summary)
+
+
+def _recorded(inputs: LoadedInputs, fresh: bool, **how: Any) -> tuple[Recording, int]:
+    """Return the finished recording of a project, and how many of its frames an earlier run had measured."""
+    setup = inputs.setup()
+    folder = inputs.folder / RESULTS_FOLDER
+    with _only_writer(folder), MeasurementStore(folder / FRAMES_FILE) as store:
+        found = None if fresh else store.find(setup.method, setup.fingerprint)
+        known = 0 if found is None else len(store.measured_frames(found))
+        return store.load(measure(setup, store, fresh=fresh, **how)), known
 
 
 @contextmanager
@@ -245,7 +248,7 @@ def relief_plan(folder: Path, project: Project) -> ReliefPlan | None:
         [RELIEF_VERSION, _cloud_identity(cloud_file), extent, below.tolist(), project.orthoimage.ground_z_m]
     )
     name = hashlib.sha256(decided.encode()).hexdigest()[:16]
-    return ReliefPlan(extent, below, folder / "results" / f"{name}-{RELIEF_FILE}")
+    return ReliefPlan(extent, below, folder / RESULTS_FOLDER / f"{name}-{RELIEF_FILE}")
 
 
 def _cloud_identity(cloud_file: Path) -> str:
@@ -299,16 +302,11 @@ def _require_runnable(inputs: LoadedInputs) -> None:
         raise InputError(f"{inputs.folder / PROJECT_FILE}: {obstacle}.")
 
 
-def _frames_known(store: MeasurementStore, setup: MeasureSetup) -> int:
-    recording = store.find(setup.method, setup.fingerprint)
-    return 0 if recording is None else len(store.measured_frames(recording))
-
-
 def _write_orthoimage(inputs: LoadedInputs, progress: Progress) -> None:
     """Write the orthoimage unless the one there was made from the same cloud and settings."""
     if inputs.project.inputs.cloud is None:
         return
-    file = inputs.folder / "results" / ORTHOIMAGE_FILE
+    file = inputs.folder / RESULTS_FOLDER / ORTHOIMAGE_FILE
     note = file.with_suffix(".made-from")
     settings = inputs.project.orthoimage.model_dump_json()
     made_from = f"{_cloud_identity(inputs.folder / inputs.project.inputs.cloud)} {settings}"

@@ -95,6 +95,7 @@ def test_each_contradiction_is_told_in_one_line(inputs: Path, change: Change, to
         return
     assert any(told in line for line in found), found
     assert all("\n" not in line and line.endswith(".") for line in found)
+    assert all(line.startswith(str(inputs)) for line in found)
 
 
 def test_all_problems_are_told_at_once(inputs: Path) -> None:
