@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ from playwright.sync_api import Page, expect
 from core.lens import read_lens
 from core.project import read_project
 from tests.browser.hands import centre_of, fitted, zoomed
-from tests.browser.live import SAMPLE, ask, ask_bytes, free_port, serving, watched
+from tests.browser.live import SAMPLE, ask, ask_bytes, watched
 from tests.browser.steps import (
     FRAME_SIZE,
     draw_bands,
@@ -33,28 +32,6 @@ WITHIN_PX = 0.5
 CLICK_PX = 0.15
 # Grey levels: corners drawn on a plain surface scatter by less, the squares of a board by more.
 BLANK_LEVELS = 35
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    """A workspace and the address of the server over it."""
-    workspace = tmp_path_factory.mktemp("workspace")
-    shutil.copytree(SAMPLE, workspace / "footage", ignore=shutil.ignore_patterns("project.json", "results"))
-    with serving(workspace, free_port()) as address:
-        yield workspace, address
-
-
-@pytest.fixture
-def project(server, request):
-    """The sample as a project of its own for each test: its folder and its pages' address."""
-    workspace, address = server
-    name = re.sub(r"[^a-z0-9]+", "-", request.node.name)[-40:].strip("-")
-    folder = workspace / name
-    folder.mkdir()
-    document = json.loads((SAMPLE / "project.json").read_text())
-    document["inputs"] = {"video": "../footage/video.mp4", "lens": "../footage/lens.yaml"}  # no cloud: nothing to read
-    (folder / "project.json").write_text(json.dumps(document))
-    return folder, f"{address}/p/{name}"
 
 
 @pytest.fixture(scope="module")
