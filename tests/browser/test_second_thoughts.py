@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from playwright.sync_api import Page, expect
 
 from core.project import read_project
-from tests.browser.hands import fitted
-from tests.browser.live import watched
-from tests.browser.steps import FRAME_SIZE, pane, ready, saved
+from tests.browser.hands import click_at, fitted
+from tests.browser.live import ask, watched
+from tests.browser.steps import FRAME_SIZE, NO_DOUBLE_CLICK_MS, ortho_px, pane, ready, saved
 
 
 def test_messages_add_no_scrollbar(browser, project):
@@ -59,3 +60,26 @@ def test_undo_takes_back_what_was_done_last(browser, project):
         expect(half).to_have_count(1)
         saved(page)
     assert [pair.id for pair in read_project(folder).correspondences] == [1, 2, *range(4, 21)]
+
+
+def test_a_band_is_drawn_again_over_the_old_one(browser, project):
+    folder, pages = project
+    before = read_project(folder).targets[0].lines
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions")
+        ready(page, "Orthorectified")
+        grid = ask(pages, "rectified")["grid"]
+        ends = np.array([before.L1.from_m, before.L1.to_m])
+        row = page.locator(".band-row[data-line=L1]")
+        row.get_by_role("button", name="Redraw").click()
+        old = page.locator("#plan [data-id='band:L1:band']")
+        assert float(old.evaluate("shape => getComputedStyle(shape).opacity")) < 1
+        inside = [ends[0] * 0.8 + ends[1] * 0.2, ends[0] * 0.2 + ends[1] * 0.8]
+        for place in (*inside, ends.mean(axis=0) + [0.0, 0.1]):
+            click_at(page, pane(page, "Orthorectified"), (grid["width"], grid["height"]), ortho_px(grid, place))
+            page.wait_for_timeout(NO_DOUBLE_CLICK_MS)
+        expect(row.locator(".found")).to_contain_text("points")
+        saved(page)
+    after = read_project(folder).targets[0].lines
+    assert np.array([after.L1.from_m, after.L1.to_m]) == pytest.approx(np.array(inside), abs=0.02)
+    assert (after.L2, after.T1) == (before.L2, before.T1)
