@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, Response, expect
+from playwright.sync_api import Page, Response, Route, expect
 
 from core.drift import high_pass
 from core.project import read_project
@@ -259,6 +259,29 @@ def test_the_corner_slider_shows_what_the_engine_filters(browser, project):
         assert np.nanmin(np.abs(1000 * expected[:, 0] - shown)) < 0.06
         expect(page.locator(".warnings")).not_to_be_empty()
         eventually(lambda: read_project(folder).drift.corner_hz == pytest.approx(corner))
+
+
+def test_nothing_of_another_corner_stands_beside_the_new_one(browser, project):
+    _, pages = project
+    held: list[Route] = []
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/drift")
+        expect(page.locator(".warnings")).not_to_be_empty()
+        expect(page.locator(".drift-lower .plot-playhead").first).to_be_visible()
+        page.route("**/drift", lambda route: route.continue_() if held else held.append(route))
+        line = page.locator(".drift-lower .plot-playhead").first
+        before = line.bounding_box()["x"]
+        page.get_by_role("slider", name="Corner frequency").focus()
+        page.keyboard.press("ArrowRight")
+        expect(page.locator(".figures")).to_have_class(re.compile("awaited"))
+        expect(page.locator(".warnings")).to_have_class(re.compile("awaited"))
+        expect(page.get_by_role("status").filter(has_text="Solving…")).to_be_visible()
+        assert line.bounding_box()["x"] > before
+        for route in held[:]:
+            route.continue_()
+        page.unroute("**/drift")
+        expect(page.locator(".figures")).not_to_have_class(re.compile("awaited"))
+        expect(page.get_by_role("status").filter(has_text="Solving…")).to_be_hidden()
 
 
 def asks_for(answer: Response, corner: float) -> bool:

@@ -136,6 +136,13 @@ export class Plot extends Emitter {
     this.place();
   }
 
+  /** Draw a curve faint that holds no longer, or fully again. @param {string} label @param {boolean} faint */
+  setFaint(label, faint) {
+    const series = this.u.series.find((entry) => entry.label === label);
+    if (series) series.alpha = faint ? 0.3 : 1;
+    this.u.redraw(false);
+  }
+
   /** @param {Interval[]} intervals */
   setIntervals(intervals) {
     this.intervals = intervals;
