@@ -109,7 +109,7 @@ def _failure(folder: ProjectFolder) -> str:
 def _is_stale(folder: ProjectFolder, project: Project, summary: dict[str, Any]) -> bool:
     now = project.model_dump(mode="json")
     then = summary.get("settings")
-    if not isinstance(then, dict) or {**then, "name": ""} != {**now, "name": ""}:
+    if not isinstance(then, dict) or _deciding(then) != _deciding(now):
         return True
     made_s = (folder.results / SUMMARY_FILE).stat().st_mtime
     for file in stored_inputs(project.inputs).values():
@@ -120,6 +120,13 @@ def _is_stale(folder: ProjectFolder, project: Project, summary: dict[str, Any]) 
         except OSError:
             return True
     return False
+
+
+def _deciding(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return what results follow from: not the name, and nothing of a filter that is not applied."""
+    drift = settings.get("drift")
+    unfiltered = isinstance(drift, dict) and drift.get("filter") == "none"
+    return {**settings, "name": "", "drift": "none" if unfiltered else drift}
 
 
 def _frames_total(folder: ProjectFolder, project: Project, exactly: bool) -> int:

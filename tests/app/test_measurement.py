@@ -143,6 +143,17 @@ def test_a_changed_project_makes_files_stale_and_is_solved_at_once(tracked: Test
     assert not tracked.get(f"{CLIP}/results").json()["stale"]
 
 
+def test_a_filter_that_is_not_applied_makes_nothing_stale(tracked: TestClient) -> None:
+    state = tracked.get(CLIP).json()
+    for drift, stale in (({"corner_hz": 0.4, "order": 6}, False), ({"filter": "high-pass"}, True)):
+        project = state["project"] | {"drift": state["project"]["drift"] | drift}
+        edit = {"project": project, "revision": state["revision"], "label": "drift"}
+        changed = tracked.put(CLIP, json=edit).json()
+        assert tracked.get(f"{CLIP}/results").json()["stale"] == stale
+        assert (changed["steps"]["export"]["status"] == "stale") == stale
+        state = tracked.post(f"{CLIP}/undo", json={"revision": changed["revision"]}).json()
+
+
 def test_the_scene_shows_camera_and_roof_lines_in_step_with_a_frame(tracked: TestClient) -> None:
     scene = tracked.app.state.context.scene  # type: ignore[attr-defined]
     tall = {"frame": 14, "exaggeration": 10.0}
