@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+
 import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
@@ -83,3 +86,46 @@ def test_a_band_is_drawn_again_over_the_old_one(browser, project):
     after = read_project(folder).targets[0].lines
     assert np.array([after.L1.from_m, after.L1.to_m]) == pytest.approx(np.array(inside), abs=0.02)
     assert (after.L2, after.T1) == (before.L2, before.T1)
+
+
+def test_another_reference_frame_asks_what_becomes_of_the_pairs(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        with page.expect_response("**/inputs"):
+            page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        field, dialog = page.get_by_label("Reference frame", exact=True), page.get_by_role("dialog")
+
+        def choose(frame: int) -> None:
+            field.fill(str(frame))
+            page.keyboard.press("Enter")
+
+        choose(9999)
+        expect(field).to_have_attribute("aria-invalid", "true")
+        choose(300)
+        expect(dialog).to_contain_text("20 pairs were clicked in frame 0")
+        dialog.get_by_role("button", name="Cancel").click()
+        expect(field).to_have_value("0")
+        choose(300)
+        dialog.get_by_role("button", name="Delete the pairs").click()
+        expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(0)
+        expect(page.locator(".pane-chip", has_text="Frame 300")).to_be_visible()
+        page.get_by_role("button", name="Undo: Reference frame 300, pairs deleted").click()
+        expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(20)
+        expect(field).to_have_value("0")
+        choose(30)
+        dialog.get_by_role("button", name="Keep the pairs").click()
+        saved(page)
+    now = read_project(folder)
+    assert (now.reference_frame, len(now.correspondences)) == (30, 20)
+
+
+def test_a_reference_frame_beyond_the_video_is_an_error_of_its_step(browser, project):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    (folder / "project.json").write_text(json.dumps(document | {"reference_frame": 9999}))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        step = page.locator("[data-step=correspondences]")
+        expect(step).to_have_attribute("data-status", "error")
+        expect(step).to_have_attribute("title", re.compile("the video ends with frame 599"))

@@ -11,7 +11,7 @@ import { h } from "../lib/dom.js";
  * @property {number} [decimals]
  * @property {number} [step]
  * @property {number} [min]
- * @property {number} [max]
+ * @property {number | (() => number)} [max]  a function where it is known later
  * @property {boolean} [optional]  may be empty (null)
  * @property {boolean} [compact]
  * @property {boolean} [bare]  without the visible label (it is still spoken)
@@ -30,9 +30,9 @@ export function numberField(options) {
     decimals = 2,
     step = 10 ** -decimals,
     min = -Infinity,
-    max = Infinity,
     optional = false,
   } = options;
+  const greatest = () => (typeof options.max === "function" ? options.max() : (options.max ?? Infinity));
   const id = `number-${(fields += 1)}`;
   const input = h("input", {
     class: "input",
@@ -75,7 +75,7 @@ export function numberField(options) {
     const text = input.value.trim().replace(",", ".").replace("\u2212", "-");
     if (text === "" && optional) return take(null);
     const value = Number(text);
-    if (text === "" || !Number.isFinite(value) || value < min || value > max)
+    if (text === "" || !Number.isFinite(value) || value < min || value > greatest())
       return input.setAttribute("aria-invalid", "true");
     if (current !== null && text === current.toFixed(decimals)) return show();
     take(value);
@@ -89,7 +89,7 @@ export function numberField(options) {
     if (turn === 0) return;
     event.preventDefault();
     const size = step * (event.shiftKey ? 10 : event.altKey ? 0.1 : 1);
-    take(Math.min(max, Math.max(min, Number(((current ?? 0) + turn * size).toFixed(8)))));
+    take(Math.min(greatest(), Math.max(min, Number(((current ?? 0) + turn * size).toFixed(8)))));
   });
   show();
   return {

@@ -14,6 +14,7 @@ import { numberField } from "../components/number-field.js";
 import { openPage } from "../components/page.js";
 import { announce, toast, toastError } from "../components/toast.js";
 import { toggleButton } from "../components/toggle-button.js";
+import { askAboutPairs } from "./correspondences/ask-about-pairs.js";
 import { fitPanel } from "./correspondences/fit-panel.js";
 import { compareControls } from "./correspondences/compare.js";
 import { linkedViews } from "./correspondences/linked-views.js";
@@ -55,6 +56,7 @@ let fit = NO_FIT;
 let linked = viewText("linked") === "1";
 let undistorted = viewText("und") === "1";
 let arrows = true;
+let lastFrame = Infinity; // until the video is known
 
 // --- the two panes
 
@@ -221,10 +223,10 @@ const referenceFrame = numberField({
   decimals: 0,
   step: 1,
   min: 0,
+  max: () => lastFrame,
   compact: true,
   bare: true,
-  onChange: (value) =>
-    void store.edit(`Reference frame ${value}`, (draft) => void (draft.reference_frame = value ?? 0)),
+  onChange: (value) => void chooseReferenceFrame(value ?? 0),
 });
 referenceFrame.element.classList.add("narrow");
 find("#tools").append(
@@ -259,6 +261,16 @@ find("#tools").append(
 );
 find("#panes").append(...panes.map((pane) => pane.element));
 
+/** Pairs were clicked in one frame of the video; in another one their places may show something else. @param {number} wanted */
+async function chooseReferenceFrame(wanted) {
+  const set = (/** @type {import("../lib/types.js").Project} */ draft) => void (draft.reference_frame = wanted);
+  const clicked = slots.pairs.length + slots.halves.length;
+  const choice = clicked === 0 ? "keep" : await askAboutPairs(clicked, store.project.reference_frame, wanted);
+  if (choice === "keep") await store.edit(`Reference frame ${wanted}`, set);
+  else if (choice === "delete") slots.removeAll(`Reference frame ${wanted}, pairs deleted`, set);
+  else referenceFrame.set(store.project.reference_frame);
+}
+
 async function importPoints() {
   const [file] = await pickFiles({ accept: ".points,.csv,.txt" });
   if (file === undefined) return;
@@ -275,6 +287,8 @@ async function importPoints() {
 }
 
 // --- pictures
+
+void get(projectPath(page.id, "inputs")).then(({ video }) => (lastFrame = (video?.frames || Infinity) - 1), toastError);
 
 /** @param {string} path @param {PairPane} side */
 const loadImage = (path, side) => PaneImage.load(`/api/${path}`, { onLevel: () => side.pane.invalidate() });

@@ -100,12 +100,15 @@ export class Slots extends Emitter {
     });
   }
 
-  /** All pairs, and the halves with them. */
-  removeAll() {
+  /** All pairs, and the halves with them. @param {string} [label] @param {(draft: Project) => void} [also] */
+  removeAll(label = "Delete all pairs", also = () => undefined) {
     const before = stampOf(this.store.project);
     const { halves } = this;
     this.#setHalves([], null);
-    void this.store.edit("Delete all pairs", (draft) => void (draft.correspondences = []));
+    void this.store.edit(label, (draft) => {
+      draft.correspondences = [];
+      also(draft);
+    });
     this.#cleared = { halves, before, after: stampOf(this.store.project) };
   }
 
