@@ -338,3 +338,26 @@ def test_table_2_says_what_the_summary_says(browser, scene, finished):
             ):
                 assert float(shown) == pytest.approx(100 * exact, abs=0.0051)
         expect(page.get_by_label("GPS", exact=True)).to_contain_text(f"{1000 * gps['rms_m']['x']:.1f}")
+
+
+def test_a_result_from_before_a_change_says_so(browser, project):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    peak = json.loads((folder / "results" / "summary.json").read_text())["targets"]["roof"]["peak_negative_m"]["x"]
+    first = round(peak["time_s"] * 30) - 2
+    (folder / "project.json").write_text(json.dumps(document | {"excluded_frames": [[first, first + 4]]}))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/export")
+        table = page.get_by_label("Peaks and residual")
+        expect(table.locator(".note")).to_contain_text("5 frames of the event excluded or lost", timeout=60_000)
+        expect(page.get_by_text("from before the change")).to_have_count(0)  # solved anew, as the project stands
+    document["targets"][0]["lines"]["L1"]["width_m"] += 0.01
+    for change in ({}, {"method": "paper"}):
+        (folder / "project.json").write_text(json.dumps(document | change))
+        with watched(browser, pages) as page:
+            page.goto(f"{pages}/export")
+            expect(page.get_by_role("status").filter(has_text="from before the change")).to_be_visible()
+            expect(page.get_by_role("link", name="Go to Track")).to_be_visible()
+            expect(page.locator(".export-overlay .plot-legend")).to_contain_text("P1")
+            expect(page.locator(".comparison tbody tr").first).to_contain_text("East")
+            expect(page.get_by_role("alert")).to_have_count(0)
