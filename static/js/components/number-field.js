@@ -1,6 +1,8 @@
 // A number with its unit: typed, or stepped with the arrow keys (Shift ten times, Alt a tenth).
 
 import { h } from "../lib/dom.js";
+import { fixed } from "../lib/format.js";
+import { fieldWords } from "./field-words.js";
 
 /**
  * @typedef {object} NumberFieldOptions
@@ -12,6 +14,7 @@ import { h } from "../lib/dom.js";
  * @property {number} [step]
  * @property {number} [min]
  * @property {number | (() => number)} [max]  a function where it is known later
+ * @property {() => string} [tooGreat]  what to say of a greater one
  * @property {boolean} [optional]  may be empty (null)
  * @property {boolean} [compact]
  * @property {boolean} [bare]  without the visible label (it is still spoken)
@@ -44,10 +47,12 @@ export function numberField(options) {
     placeholder: options.placeholder ?? (optional ? "–" : ""),
     "aria-label": options.bare ? `${label}${unit ? `, ${unit}` : ""}` : null,
   });
+  const words = fieldWords(input);
   const box = h(
     "div",
     { class: `number-field ${options.compact ? "compact" : ""}` },
     input,
+    words.element,
     h("span", { class: "unit" }, unit),
   );
   const element = options.bare
@@ -61,6 +66,8 @@ export function numberField(options) {
       );
   let current = options.value;
 
+  const refuse = (/** @type {number} */ value) =>
+    words.say(options.tooGreat && value > greatest() ? options.tooGreat() : permitted(min, greatest(), decimals, unit));
   const show = () => {
     input.value = current === null ? "" : current.toFixed(decimals);
     input.removeAttribute("aria-invalid");
@@ -75,8 +82,10 @@ export function numberField(options) {
     const text = input.value.trim().replace(",", ".").replace("\u2212", "-");
     if (text === "" && optional) return take(null);
     const value = Number(text);
-    if (text === "" || !Number.isFinite(value) || value < min || value > greatest())
-      return input.setAttribute("aria-invalid", "true");
+    if (text === "" || !Number.isFinite(value) || value < min || value > greatest()) {
+      input.setAttribute("aria-invalid", "true");
+      return refuse(value);
+    }
     if (current !== null && text === current.toFixed(decimals)) return show();
     take(value);
   };
@@ -89,7 +98,9 @@ export function numberField(options) {
     if (turn === 0) return;
     event.preventDefault();
     const size = step * (event.shiftKey ? 10 : event.altKey ? 0.1 : 1);
-    take(Math.min(greatest(), Math.max(min, Number(((current ?? 0) + turn * size).toFixed(8)))));
+    const wanted = Number(((current ?? 0) + turn * size).toFixed(8));
+    take(Math.min(greatest(), Math.max(min, wanted)));
+    if (wanted !== current) refuse(wanted);
   });
   show();
   return {
@@ -103,4 +114,12 @@ export function numberField(options) {
       else input.value = current === null ? "" : current.toFixed(decimals);
     },
   };
+}
+
+/** What a field takes, in words. @param {number} min @param {number} max @param {number} decimals @param {string} unit */
+function permitted(min, max, decimals, unit) {
+  const [least, most] = [min, max].map((value) => fixed(value, value % 1 === 0 ? 0 : decimals));
+  const range = Number.isFinite(min) && Number.isFinite(max) ? `from ${least} to ${most}` : "";
+  const half = Number.isFinite(min) ? `of at least ${least}` : Number.isFinite(max) ? `of at most ${most}` : "";
+  return ["A number", range || half, range || half ? unit : ""].filter(Boolean).join(" ") + ", please.";
 }
