@@ -129,3 +129,45 @@ def test_a_reference_frame_beyond_the_video_is_an_error_of_its_step(browser, pro
         step = page.locator("[data-step=correspondences]")
         expect(step).to_have_attribute("data-status", "error")
         expect(step).to_have_attribute("title", re.compile("the video ends with frame 599"))
+
+
+def test_a_roof_lies_below_the_camera_and_its_points_as_far_apart_as_told(browser, project):
+    folder, pages = project
+    before = read_project(folder)
+    with watched(browser, pages) as page:
+        with page.expect_response("**/fit"):
+            page.goto(f"{pages}/regions")
+        ready(page, "Orthorectified")
+        height, apart = (page.get_by_role("textbox", name=name) for name in ("Height above ground", "P1–P2 distance"))
+        height.fill("60")
+        page.keyboard.press("Enter")
+        expect(page.get_by_role("alert")).to_contain_text("The camera is 42")
+        page.keyboard.press("Escape")
+        expect(height).to_have_value(f"{before.targets[0].height_m:.2f}")
+        for told, look in ((1.22, "note"), (1.26, "note warn"), (2.0, "note bad")):
+            apart.fill(str(told))
+            page.keyboard.press("Enter")
+            words = page.locator("#bands .note")
+            expect(words).to_contain_text(f"{told:.3f} m is given")
+            assert words.get_attribute("class").strip() == look
+        saved(page)
+    assert read_project(folder).targets[0].height_m == before.targets[0].height_m
+
+
+def test_a_number_field_says_what_it_takes(browser, project):
+    _, pages = project
+    with watched(browser, pages) as page:
+        with page.expect_response("**/inputs"):
+            page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        field, words = page.get_by_label("Reference frame", exact=True), page.get_by_role("alert")
+        for typed in ("9999", "abc"):
+            field.fill(typed)
+            page.keyboard.press("Enter")
+            expect(words).to_have_text("A number from 0 to 599, please.")
+            page.keyboard.press("Escape")
+            expect(field).to_have_value("0")
+        field.press("ArrowDown")
+        expect(words).to_be_visible()
+        field.fill("")
+        expect(words).to_be_hidden()

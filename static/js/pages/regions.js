@@ -41,6 +41,7 @@ if (wanted !== null) targets.select(wanted);
 let grid = { west_m: 0, north_m: 0, pixel_size_m: 0.01, width: 0, height: 0 };
 /** @type {Preview | null} */
 let preview = null;
+let camera_m = Infinity; // height above the ground, until the fit is known
 
 const toPixels = (/** @type {Point} */ plan) => orthoFromWorld(grid, plan);
 const toPlan = (/** @type {Point} */ pixels) => worldFromOrtho(grid, pixels);
@@ -125,7 +126,7 @@ planPane.addPainter(edgePainter(() => preview, "plan", toPixels));
 
 // --- panels
 
-const showTargets = targetsPanel(find("#targets"), targets);
+const showTargets = targetsPanel(find("#targets"), targets, () => camera_m);
 const showBands = bandsPanel(find("#bands"), bands, (line, band) => saveBand(line, band, `Number of ${line}`, true));
 const showMoving = movingPanel(find("#moving"), {
   onSelect: (index) => moving.select(index),
@@ -351,17 +352,25 @@ async function loadPlan() {
   }
 }
 
+async function findCamera() {
+  const { correspondences } = store.project;
+  const { camera } = await post(projectPath(page.id, "fit"), { correspondences });
+  camera_m = camera?.height_m ?? Infinity;
+}
+
 store.on("change", ({ project, previous }) => {
   const rectifiedAnew =
     JSON.stringify([project.correspondences, project.orthoimage, project.inputs]) !==
     JSON.stringify([previous.correspondences, previous.orthoimage, previous.inputs]);
   if (project.reference_frame !== previous.reference_frame) void loadFrame();
+  if (rectifiedAnew) void findCamera().catch(toastError);
   if (rectifiedAnew || project.reference_frame !== previous.reference_frame) void loadPlan().catch(toastError);
 });
 page.events.on("orthoimage", () => void loadPlan());
 
 showTargets();
 draw();
+void findCamera().catch(toastError);
 await Promise.all([loadFrame(), loadPlan()]);
 const drawn = [...Object.values(bands.bands).flatMap(cornersOf), ...(targets.selected?.region_m ?? [])].map(toPixels);
 if (drawn.length > 0 && planPane.image !== null) planPane.lookAtAll(drawn);

@@ -12,8 +12,8 @@ import { toast } from "../../components/toast.js";
 /** @typedef {import("../../lib/targets.js").Targets} Targets */
 /** @typedef {import("../../lib/targets.js").OpenTarget} OpenTarget */
 
-/** @param {HTMLElement} element @param {Targets} targets */
-export function targetsPanel(element, targets) {
+/** @param {HTMLElement} element @param {Targets} targets @param {() => number} camera_m  height of the camera above the ground */
+export function targetsPanel(element, targets, camera_m) {
   const add = menuButton({
     label: "Add target",
     icon: "add",
@@ -36,6 +36,8 @@ export function targetsPanel(element, targets) {
     value: null,
     optional: true,
     step: 0.05,
+    max: () => camera_m() - 0.01,
+    tooGreat: () => `The camera is ${metres(camera_m(), 1)} above the ground by the pairs; a roof lies below it.`,
     onChange: (value) => change("Height", (target) => void (target.height_m = value)),
   });
   const apart = numberField({
