@@ -171,3 +171,24 @@ def test_a_number_field_says_what_it_takes(browser, project):
         expect(words).to_be_visible()
         field.fill("")
         expect(words).to_be_hidden()
+
+
+def test_arrows_nudge_after_a_pair_is_looked_up(browser, project):
+    folder, pages = project
+    before = read_project(folder).correspondences
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        page.keyboard.press("n")
+        page.keyboard.press("ArrowRight")
+        page.locator("#pairs tbody tr[data-id='3']").click()
+        page.keyboard.press("Shift+ArrowRight")
+        page.get_by_role("button", name="Undo: Nudge pair 3").wait_for()
+        row = page.locator("#pairs tbody tr[data-id='3']")
+        row.focus()
+        page.keyboard.press("ArrowDown")  # in the table by keys: it stays there
+        expect(page.locator("#pairs tbody tr[data-id='4']")).to_be_focused()
+        page.keyboard.press("ArrowRight")
+        saved(page)
+    moved = [b.frame_px[0] - a.frame_px[0] for a, b in zip(before, read_project(folder).correspondences, strict=True)]
+    assert moved[:4] == pytest.approx([0.1, 0.0, 1.0, 0.1])

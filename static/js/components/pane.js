@@ -60,6 +60,8 @@ export class Pane extends Emitter {
     this.size = [element.clientWidth || 1, element.clientHeight || 1];
     /** @type {Point | null} image px under the pointer */
     this.cursor = null;
+    /** When it last had the focus; of several, keys go to the newest. */
+    this.usedAt = 0;
     this.#fitted = false;
     element.classList.add("pane");
     element.classList.toggle("view-only", viewOnly);
@@ -235,6 +237,7 @@ export class Pane extends Emitter {
     element.addEventListener("pointercancel", () => this.#giveUp());
     element.addEventListener("lostpointercapture", () => this.#giveUp());
     element.addEventListener("pointerleave", () => this.#hover(null, null));
+    element.addEventListener("focus", () => (this.usedAt = performance.now()));
     element.addEventListener("keydown", (event) => {
       if (event.key === "Escape" && this.isDragging) {
         event.preventDefault();

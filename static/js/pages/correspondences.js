@@ -8,7 +8,7 @@ import { fixed, plural } from "../lib/format.js";
 import { latest } from "../lib/latest.js";
 import { setView, viewNumber, viewText } from "../lib/view-state.js";
 import { PaneImage } from "../components/pane-image.js";
-import { nudgeKeys, paneKeys } from "../components/pane-keys.js";
+import { activePane, nudgeKeys, paneKeys } from "../components/pane-keys.js";
 import { menuButton } from "../components/menu.js";
 import { numberField } from "../components/number-field.js";
 import { openPage } from "../components/page.js";
@@ -79,6 +79,7 @@ const ortho = new PairPane(h("div"), slots, {
 const sides = /** @type {[PairPane, PairPane]} */ ([frame, ortho]);
 const panes = sides.map((side) => side.pane);
 const focused = () => sides.find((side) => side.pane.hasFocus) ?? null;
+const sideOf = (/** @type {import("../components/pane.js").Pane} */ pane) => sides.find((side) => side.pane === pane);
 /** @param {Point} place */
 const placeWords = (place) => place.map((value) => fixed(value, 2)).join(", ");
 
@@ -156,6 +157,8 @@ function goTo(id) {
   if (id === null) return;
   slots.select(id);
   for (const side of sides) side.goTo(id, REFINE_SCALE);
+  const inTable = document.activeElement?.matches("#pairs tr:focus-visible") ?? false; // moving through it by keys
+  if (!inTable) sideOf(activePane(panes))?.focus();
 }
 
 /** @param {number} step */
@@ -369,7 +372,7 @@ page.keys([
   ...nudgeKeys(panes, {
     what: "the selected mark",
     when: () => hasSelection(),
-    nudge: (_pane, delta) => focused()?.nudge(delta),
+    nudge: (pane, delta) => sideOf(pane)?.nudge(delta),
   }),
   {
     keys: "Delete / Backspace",
@@ -427,7 +430,7 @@ page.keys([
   { keys: "S", group: "Looking", label: "Swipe between the two", run: () => compare.choose("swipe") },
   { keys: "[", group: "Looking", label: "Blend or swipe less", run: () => compare.step(-0.1) },
   { keys: "]", group: "Looking", label: "Blend or swipe more", run: () => compare.step(0.1) },
-  ...paneKeys(panes, { canPan: () => !hasSelection() }),
+  ...paneKeys(panes, { canPan: () => !hasSelection(), chosen: activePane }),
 ]);
 
 // --- flow

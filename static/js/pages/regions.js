@@ -11,7 +11,7 @@ import { Loupe } from "../components/loupe.js";
 import { Pane } from "../components/pane.js";
 import { paneChrome } from "../components/pane-chrome.js";
 import { PaneImage } from "../components/pane-image.js";
-import { nudgeKeys, paneKeys } from "../components/pane-keys.js";
+import { activePane, nudgeKeys, paneKeys } from "../components/pane-keys.js";
 import { openPage } from "../components/page.js";
 import { PolygonEditor } from "../components/polygon-editor.js";
 import { segmented } from "../components/segmented.js";
@@ -235,7 +235,7 @@ const focusedEditor = () => {
   const pane = focusedPane();
   return pane === null ? null : editorOf(pane);
 };
-const bandKeys = () => planPane.hasFocus && bands.selected !== null;
+const bandKeys = () => activePane(panes) === planPane && bands.selected !== null;
 page.keys([
   {
     keys: "Click",
@@ -303,7 +303,7 @@ page.keys([
     run: () => loupes.forEach((loupe) => loupe.setEnabled(!loupe.enabled)),
   },
   { keys: "V", group: "Looking", label: "Both pictures, the frame, the orthorectified frame", run: nextLayout },
-  ...paneKeys(panes, { canPan: () => focusedEditor()?.selected == null }),
+  ...paneKeys(panes, { canPan: () => editorOf(activePane(panes)).selected === null, chosen: activePane }),
 ]);
 
 // --- pictures

@@ -167,6 +167,12 @@ export class PairPane extends Emitter {
     if (place !== null) this.pane.lookAt(place, Math.max(scale, this.pane.view.scale));
   }
 
+  /** Take the keys, without aiming. */
+  focus() {
+    this.pane.element.focus({ preventScroll: true });
+    this.#setAim(false);
+  }
+
   /** Move the selected mark a little. @param {Point} delta px shown */
   nudge(delta) {
     const id = this.slots.selected;
