@@ -192,3 +192,18 @@ def test_arrows_nudge_after_a_pair_is_looked_up(browser, project):
         saved(page)
     moved = [b.frame_px[0] - a.frame_px[0] for a, b in zip(before, read_project(folder).correspondences, strict=True)]
     assert moved[:4] == pytest.approx([0.1, 0.0, 1.0, 0.1])
+
+
+def test_the_keyboard_aims_only_when_it_is_used(browser, project):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        aim = page.locator("[data-id=aim]")
+        click_share(page, (0.03, 0.5))
+        expect(page.locator("[data-id='pair-21']")).to_have_count(1)
+        expect(aim).to_have_count(0)
+        page.keyboard.press("n")
+        expect(aim).to_have_count(0)
+        page.keyboard.press("+")
+        expect(aim).to_have_count(1)

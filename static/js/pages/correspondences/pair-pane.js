@@ -150,7 +150,7 @@ export class PairPane extends Emitter {
         shapes.push({ id: `ghost-${half.id}`, kind: "mark", class: "ghost", label: `${half.id}?`, points: [ghost] });
     }
     if (this.#aims && this.pane.image !== null)
-      shapes.push({ id: "aim", kind: "mark", class: "aim", points: [this.pane.centre] });
+      shapes.push({ id: "aim", kind: "aim", points: [this.pane.centre] });
     this.pane.setShapes(shapes);
     const half = this.slots.waitingFor(this.side);
     this.chrome.setHint(half === null ? "" : `Click completes pair ${half.id}`);
@@ -204,10 +204,17 @@ export class PairPane extends Emitter {
     pane.on("drop", ({ id, point }) => this.#store(point, (stored) => this.slots.move(idOf(id), this.side, stored)));
     pane.on("cancel", () => this.refresh());
     pane.on("view", () => this.draw());
-    pane.element.addEventListener("keydown", () => this.#setAim(true));
+    pane.element.addEventListener("keydown", ({ key }) => this.#aimsBy(key) && this.#setAim(true));
     pane.element.addEventListener("focus", () => this.#setAim(pane.element.matches(":focus-visible")));
     pane.element.addEventListener("blur", () => this.#setAim(false));
-    pane.element.addEventListener("pointermove", () => this.#setAim(false));
+    for (const name of ["pointerdown", "pointermove"])
+      pane.element.addEventListener(name, () => this.#setAim(false));
+  }
+
+  /** Whether a key moves the view, and so the aim, or places there. @param {string} key */
+  #aimsBy(key) {
+    const pans = key.startsWith("Arrow") && this.slots.selected === null;
+    return pans || ["+", "=", "-", "0", "1", "Enter", " "].includes(key);
   }
 
   /** @param {Point} point px shown */
