@@ -207,3 +207,19 @@ def test_the_keyboard_aims_only_when_it_is_used(browser, project):
         expect(aim).to_have_count(0)
         page.keyboard.press("+")
         expect(aim).to_have_count(1)
+
+
+def test_a_click_completes_the_half_that_is_selected(browser, project):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        hint = pane(page, "Orthoimage").locator(".attention")
+        for u in (0.03, 0.06):
+            click_share(page, (u, 0.5))
+            page.wait_for_timeout(NO_DOUBLE_CLICK_MS)
+        expect(page.locator("#selection h2")).to_have_text("Pair 22, unfinished")
+        expect(hint).to_have_text("Click completes pair 22")
+        click_share(page, (0.03, 0.5))
+        expect(page.locator("#selection h2")).to_have_text("Pair 21, unfinished")
+        expect(hint).to_have_text("Click completes pair 21")

@@ -38,9 +38,10 @@ export class Slots extends Emitter {
     return this.store.project.correspondences;
   }
 
-  /** The half that the next click on a side completes. @param {Side} side */
+  /** The half that the next click on a side completes: the selected one, else the oldest. @param {Side} side */
   waitingFor(side) {
-    return this.halves.find((half) => half[side] === null) ?? null;
+    const waiting = this.halves.filter((half) => half[side] === null);
+    return waiting.find((half) => half.id === this.selected) ?? waiting[0] ?? null;
   }
 
   /** A click on a side: fills the next free slot, or opens one. @param {Side} side @param {Point} point @returns {number} id of the pair */
