@@ -12,7 +12,7 @@ from playwright.sync_api import Page, expect
 from core.project import read_project
 from tests.browser.hands import click_at, fitted
 from tests.browser.live import ask, watched
-from tests.browser.steps import FRAME_SIZE, NO_DOUBLE_CLICK_MS, ortho_px, pane, ready, saved
+from tests.browser.steps import FRAME_SIZE, NO_DOUBLE_CLICK_MS, make_orthoimage, ortho_px, pane, ready, saved
 
 
 def test_messages_add_no_scrollbar(browser, project):
@@ -223,3 +223,30 @@ def test_a_click_completes_the_half_that_is_selected(browser, project):
         click_share(page, (0.03, 0.5))
         expect(page.locator("#selection h2")).to_have_text("Pair 21, unfinished")
         expect(hint).to_have_text("Click completes pair 21")
+
+
+def test_residuals_are_as_long_in_both_pictures_and_say_how_enlarged(browser, project):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    document["inputs"]["cloud"] = "../footage/site.laz"
+    (folder / "project.json").write_text(json.dumps(document))
+    with watched(browser, pages) as page:
+        make_orthoimage(page, pages, "4")
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Orthoimage")
+        for name in ("Reference frame", "Orthoimage"):
+            expect(pane(page, name).locator(".legend")).to_have_text(re.compile(r"^→ residuals × \d+"))
+            order = pane(page, name).evaluate(
+                "pane => [...pane.querySelectorAll('.shapes > g')].map(g => g.dataset.id)"
+            )
+            assert max(i for i, shape in enumerate(order) if shape.startswith("residual")) < order.index("pair-1")
+        lengths = [arrow_length(page, name, 13) for name in ("Reference frame", "Orthoimage")]
+        assert lengths[0] == pytest.approx(lengths[1], rel=0.1)
+        page.keyboard.press("r")
+        expect(page.locator(".legend:visible")).to_have_count(0)
+
+
+def arrow_length(page: Page, name: str, number: int) -> float:
+    path = pane(page, name).locator(f"[data-id=residual-{number}] .ink").get_attribute("d")
+    tail, head = (np.array(place.split(" "), dtype=float) for place in re.findall(r"[ML]([-\d. ]+)", path)[:2])
+    return float(np.hypot(*(head - tail)))

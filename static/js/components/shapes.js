@@ -40,14 +40,18 @@ export class ShapeLayer {
 
   /** @param {Shape[]} shapes @param {View} view @param {string | null} hot id under the pointer */
   draw(shapes, view, hot) {
-    const gone = new Set(this.#drawn.keys());
-    for (const shape of shapes) {
-      gone.delete(shape.id);
-      this.#place(shape, view, shape.id === hot);
-    }
-    for (const id of gone) {
-      this.#drawn.get(id)?.group.remove();
+    const wanted = new Set(shapes.map((shape) => shape.id));
+    for (const [id, { group }] of this.#drawn) {
+      if (wanted.has(id)) continue;
+      group.remove();
       this.#drawn.delete(id);
+    }
+    let next = this.element.firstElementChild;
+    for (const shape of shapes) {
+      this.#place(shape, view, shape.id === hot);
+      const { group } = this.#parts(shape.id);
+      if (group === next) next = next.nextElementSibling;
+      else this.element.insertBefore(group, next); // later shapes lie on top, whichever was made first
     }
   }
 
@@ -61,7 +65,6 @@ export class ShapeLayer {
       const group = svg("g", { "data-id": id }, halo, ink, text);
       parts = { group, halo, ink, text };
       this.#drawn.set(id, parts);
-      this.element.append(group);
     }
     return parts;
   }

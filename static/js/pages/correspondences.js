@@ -18,7 +18,7 @@ import { askAboutPairs } from "./correspondences/ask-about-pairs.js";
 import { fitPanel } from "./correspondences/fit-panel.js";
 import { compareControls } from "./correspondences/compare.js";
 import { linkedViews } from "./correspondences/linked-views.js";
-import { PairPane, halvesWithout, identity } from "./correspondences/pair-pane.js";
+import { ARROW_PX, PairPane, halvesWithout, identity } from "./correspondences/pair-pane.js";
 import { lengthOf, pairsTable } from "./correspondences/pairs-table.js";
 import { pairsFromPoints, pointsText } from "./correspondences/points-file.js";
 import { Slots, otherSide } from "./correspondences/slots.js";
@@ -123,6 +123,8 @@ function showFit() {
   ortho.residuals = residuals(({ ground_m }, { predicted_m }) =>
     grid === null ? null : subtract(orthoFromWorld(grid, predicted_m), orthoFromWorld(grid, ground_m)),
   );
+  // as long for as many metres as in the frame
+  if (grid !== null && fit.rms_px && fit.rms_m) ortho.arrowPx = (ARROW_PX * grid.pixel_size_m * fit.rms_px) / fit.rms_m;
   sides.forEach((side) => side.draw());
   void findGhosts();
 }
