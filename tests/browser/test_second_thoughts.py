@@ -250,3 +250,20 @@ def arrow_length(page: Page, name: str, number: int) -> float:
     path = pane(page, name).locator(f"[data-id=residual-{number}] .ink").get_attribute("d")
     tail, head = (np.array(place.split(" "), dtype=float) for place in re.findall(r"[ML]([-\d. ]+)", path)[:2])
     return float(np.hypot(*(head - tail)))
+
+
+def test_the_loupe_shows_the_picture_that_is_shown(browser, project):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        lies = fitted(page, pane(page, "Reference frame"), FRAME_SIZE)
+        page.mouse.move(*np.round(lies.window(np.array(FRAME_SIZE) * [0.1, 0.9])))
+        loupe = pane(page, "Reference frame").locator(".loupe canvas")
+        pixels = "canvas => canvas.toDataURL()"
+        page.wait_for_timeout(300)
+        before = loupe.evaluate(pixels)
+        page.keyboard.press("u")
+        expect(page.locator(".pane-chip", has_text="undistorted")).to_be_visible()
+        page.wait_for_timeout(300)
+        assert loupe.evaluate(pixels) != before

@@ -22,6 +22,7 @@ import { ShapeLayer, shapeAt } from "./shapes.js";
  * @property {{point: Point | null, id: string | null}} hover
  * @property {{point: Point, id: string | null}} doubleclick
  * @property {View} view
+ * @property {PaneImage | null} picture  another one is shown
  */
 
 const STILL_PX = 3;
@@ -36,6 +37,8 @@ export class Pane extends Emitter {
   #shapes = [];
   /** @type {string | null} */
   #hot = null;
+  /** @type {Point | null} CSS px, where the pointer is */
+  #at = null;
   #drawing = 0;
   #lastClick = { time: 0, at: /** @type {Point} */ ([0, 0]) };
   /** @type {{at: Point, last: Point, moved: boolean, shape: Shape | null, from: Point, pointer: number} | null} */
@@ -103,6 +106,8 @@ export class Pane extends Emitter {
     this.image = image;
     this.element.dataset.picture = image === null ? "" : `${image.width}x${image.height}`;
     if (image !== null && !same) this.fit();
+    if (this.#at !== null) this.#hover(this.#at, shapeAt(this.#shapes, this.view, this.#at));
+    this.emit("picture", image);
     this.invalidate();
   }
 
@@ -318,6 +323,7 @@ export class Pane extends Emitter {
   /** @param {Point | null} at CSS px @param {Shape | null} shape */
   #hover(at, shape) {
     const id = shape?.id ?? null;
+    this.#at = at;
     this.cursor = at === null ? null : this.view.toImage(at);
     if (id !== this.#hot) {
       this.#hot = id;

@@ -14,13 +14,13 @@ import { numberField } from "../components/number-field.js";
 import { openPage } from "../components/page.js";
 import { announce, toast, toastError } from "../components/toast.js";
 import { toggleButton } from "../components/toggle-button.js";
-import { askAboutPairs } from "./correspondences/ask-about-pairs.js";
+import { askAboutImport, askAboutPairs } from "./correspondences/ask-about-pairs.js";
 import { fitPanel } from "./correspondences/fit-panel.js";
 import { compareControls } from "./correspondences/compare.js";
 import { linkedViews } from "./correspondences/linked-views.js";
 import { ARROW_PX, PairPane, halvesWithout, identity } from "./correspondences/pair-pane.js";
 import { lengthOf, pairsTable } from "./correspondences/pairs-table.js";
-import { pairsFromPoints, pointsText } from "./correspondences/points-file.js";
+import { notAmong, pairsFromPoints, pointsText } from "./correspondences/points-file.js";
 import { Slots, otherSide } from "./correspondences/slots.js";
 import { selectionPanel } from "./correspondences/selection-panel.js";
 import { transformer, undistortion } from "./correspondences/transform.js";
@@ -280,12 +280,19 @@ async function importPoints() {
   const [file] = await pickFiles({ accept: ".points,.csv,.txt" });
   if (file === undefined) return;
   try {
-    const imported = pairsFromPoints(await file.text(), file.name);
+    const read = pairsFromPoints(await file.text(), file.name);
+    const fresh = notAmong(read, slots.pairs);
+    if (fresh.length === 0) return void toast(`All ${plural(read.length, "pair")} of ${file.name} are here already.`);
+    const counts = { now: slots.pairs.length, read: read.length, fresh: fresh.length };
+    const choice = counts.now === 0 ? "add" : await askAboutImport(file.name, counts);
+    if (choice === null) return;
+    const imported = choice === "add" ? fresh : read;
     await store.edit(`Import ${plural(imported.length, "pair")}`, (draft) => {
+      if (choice === "replace") draft.correspondences = [];
       const first = Math.max(0, ...draft.correspondences.map((pair) => pair.id)) + 1;
       draft.correspondences.push(...imported.map((pair, i) => ({ id: first + i, ...pair })));
     });
-    toast(`${plural(imported.length, "pair")} added from ${file.name}.`, { tone: "good" });
+    toast(`${plural(imported.length, "pair")} taken from ${file.name}.`, { tone: "good" });
   } catch (error) {
     toastError(error);
   }
