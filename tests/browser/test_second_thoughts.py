@@ -15,12 +15,14 @@ from tests.browser.live import ask, watched
 from tests.browser.steps import FRAME_SIZE, NO_DOUBLE_CLICK_MS, make_orthoimage, ortho_px, pane, ready, saved
 
 
-def test_messages_add_no_scrollbar(browser, project):
+def test_messages_add_no_scrollbar_and_do_not_pile_up(browser, project):
     _, pages = project
     with watched(browser, pages) as page:
         page.goto(f"{pages}/correspondences")
         ready(page, "Reference frame")
-        page.evaluate("""async () => (await import("/static/js/components/toast.js")).toast("A word.")""")
+        for _ in range(2):
+            page.evaluate("""async () => (await import("/static/js/components/toast.js")).toast("A word.")""")
+        expect(page.get_by_text("A word.")).to_have_count(1)  # said twice, shown once
         expect(page.get_by_text("A word.")).to_be_visible()
         assert page.evaluate("document.documentElement.scrollHeight") == page.evaluate("innerHeight")
 
@@ -267,3 +269,35 @@ def test_the_loupe_shows_the_picture_that_is_shown(browser, project):
         expect(page.locator(".pane-chip", has_text="undistorted")).to_be_visible()
         page.wait_for_timeout(300)
         assert loupe.evaluate(pixels) != before
+
+
+def test_the_fit_stays_where_it_is_when_a_pair_is_switched_off(browser, project):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        figures, table = page.locator("#fit .figures"), page.locator("#pairs")
+        expect(figures).to_contain_text("20")
+        before = table.bounding_box()
+        page.get_by_role("checkbox", name="Pair 2 counts").click()
+        expect(figures).to_contain_text("19 / 20")
+        assert table.bounding_box() == before
+
+
+def test_a_look_at_what_is_not_there_yet_is_no_error(browser, project):
+    folder, pages = project
+    address = pages.split("/p/")[0]
+    bare = folder.with_name("without-a-video")
+    bare.mkdir()
+    (bare / "project.json").write_text(json.dumps({"rooftrack": 1, "name": "bare", "inputs": {"video": "video.mp4"}}))
+    refused: list[str] = []
+    with watched(browser, pages) as page:
+        page.on("response", lambda answer: refused.append(answer.url) if answer.status >= 400 else None)
+        page.goto(address)
+        expect(page.locator(".project-card", has_text="bare")).to_be_visible()
+        page.goto(f"{pages}/inputs")
+        expect(page.locator(".input-card[data-kind=lens]")).to_contain_text("not in the file")
+        page.goto(f"{pages}/track")
+        expect(page.get_by_role("button", name="Start")).to_be_visible()
+        page.goto(f"{pages}/export")
+        expect(page.get_by_role("heading", name="Nothing measured yet")).to_be_visible()
+    assert refused == []

@@ -249,8 +249,10 @@ export class Plot extends Emitter {
   axisX() {
     const ink = () => this.colour("--plot-axis");
     const unit = this.options.xUnit ?? "s";
-    const values = (/** @type {uPlot} */ _, /** @type {number[]} */ ticks) =>
-      ticks.map((tick, i) => (tick == null ? "" : i === ticks.length - 1 ? `${round(tick)} ${unit}` : round(tick)));
+    const values = (/** @type {uPlot} */ _, /** @type {number[]} */ ticks) => {
+      const last = ticks.findLastIndex((tick) => tick != null); // a logarithmic axis writes only some of its ticks
+      return ticks.map((tick, i) => (tick == null ? "" : i === last ? `${round(tick)} ${unit}` : round(tick)));
+    };
     return {
       stroke: ink,
       size: 30,

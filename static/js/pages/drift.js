@@ -111,6 +111,7 @@ const orderField = numberField({
 const kneeButton = h("button", {
   type: "button",
   class: "button small",
+  hidden: true,
   onclick: () => typeCorner(sweep?.knee_hz ?? null),
 });
 const kneeWords = h("p", { class: "small soft" });

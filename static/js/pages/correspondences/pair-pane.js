@@ -150,7 +150,7 @@ export class PairPane extends Emitter {
     const half = this.slots.waitingFor(this.side);
     this.chrome.setHint(half === null ? "" : `Click completes pair ${half.id}`);
     const scale = fixed(this.#arrowScale, this.#arrowScale < 10 ? 1 : 0);
-    this.chrome.setLegend(this.residuals.size === 0 ? "" : `→ residuals × ${scale}`);
+    this.chrome.setLegend(this.residuals.size === 0 || this.pane.image === null ? "" : `→ residuals × ${scale}`);
   }
 
   /** Residuals, below all marks and their numbers. @returns {import("../../components/shapes.js").Shape[]} */
