@@ -109,7 +109,7 @@ def _failure(folder: ProjectFolder) -> str:
 def _is_stale(folder: ProjectFolder, project: Project, summary: dict[str, Any]) -> bool:
     now = project.model_dump(mode="json")
     then = summary.get("settings")
-    if not isinstance(then, dict) or {**then, "name": ""} != {**now, "name": ""}:
+    if not isinstance(then, dict) or _deciding(then) != _deciding(now):
         return True
     return summary.get("identity") != _identities(folder, project)
 
@@ -121,6 +121,13 @@ def _identities(folder: ProjectFolder, project: Project) -> dict[str, str] | Non
         return {stored: identity(file) for stored, file in files.items() if stored is not None and file is not None}
     except (InputError, ApiError):
         return None
+
+
+def _deciding(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return what results follow from: not the name, and nothing of a filter that is not applied."""
+    drift = settings.get("drift")
+    unfiltered = isinstance(drift, dict) and drift.get("filter") == "none"
+    return {**settings, "name": "", "drift": "none" if unfiltered else drift}
 
 
 def _frames_total(folder: ProjectFolder, project: Project, exactly: bool) -> int:

@@ -12,10 +12,11 @@ from app import orthoimages, outcome
 from app.errors import ApiError
 from app.reference import reference_fit
 from app.store import ProjectFolder, problem_of, stored_inputs
-from app.videos import is_read_through
+from app.videos import is_read_through, video_info
 from core.check import check_project
 from core.errors import InputError
 from core.project import Project, project_json
+from core.video import frame_index
 
 if TYPE_CHECKING:
     from app.context import Context
@@ -127,7 +128,19 @@ def _orthoimage(seen: _Look) -> Step:
     return _step("done", "")
 
 
+def _frames(seen: _Look) -> int | None:
+    """Return how many frames the video has, as far as that can be told at once."""
+    try:
+        video = seen.folder.require_video(seen.project)
+        return len(frame_index(video)) if _is_read_through(seen) else video_info(video).frames
+    except (InputError, ApiError):
+        return None
+
+
 def _correspondences(seen: _Look) -> Step:
+    frames, reference = _frames(seen), seen.project.reference_frame
+    if frames is not None and reference >= frames:
+        return _step("error", f"Reference frame {reference}: the video ends with frame {frames - 1}; choose another.")
     enabled = sum(pair.enabled for pair in seen.project.correspondences)
     if enabled < 4:
         return _step("todo", f"{enabled} pairs of at least 4, better 20.")

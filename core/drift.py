@@ -205,13 +205,18 @@ def _residual_warnings(
     for axis, name in enumerate(AXIS_NAMES):
         was, remains = float(np.nanmean(before[chosen, axis])), float(np.nanmean(after[chosen, axis]))
         if abs(was) > max(0.005, 1.5 * drift[axis]) and abs(remains) < 0.7 * abs(was):
-            eaten.append(f"along {name} {100 * was:.1f} cm {source} and {100 * remains:.1f} cm after it")
+            eaten.append(f"along {name} {_centimetres(was)} {source} and {_centimetres(remains)} after it")
     if not eaten:
         return []
     return [
         f"The filter removes the residual displacement: {', '.join(eaten)}. "
         "Use the geometric method without a filter where a residual matters."
     ]
+
+
+def _centimetres(value_m: float) -> str:
+    """Return a length in words, with a real minus sign, and none before zero."""
+    return f"{round(100 * value_m, 1) + 0.0:.1f} cm".replace("-", "\u2212")
 
 
 def _pre_event_warnings(after: Floats, times: Floats, intervals: Intervals, corner_hz: float) -> list[str]:

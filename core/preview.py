@@ -68,6 +68,7 @@ class TargetPreview:
         region_raw: (M, 2) outline of a points target.
         p1, p2: the points whose displacement is reported; None where their lines were not found.
         message: what is wrong with the target as a whole; empty where nothing is.
+        p1_p2_error: share by which P1 and P2 lie farther apart than is given; None where that cannot be told.
     """
 
     lines: Mapping[str, LinePreview]
@@ -77,6 +78,7 @@ class TargetPreview:
     p1: PointPreview | None
     p2: PointPreview | None
     message: str
+    p1_p2_error: float | None = None
 
 
 class _Frame:
@@ -128,11 +130,12 @@ def preview_bands(
     seen = _Frame(luma, fit)
     lines = {line: _preview_line(seen, band, f"targets.{name}.lines.{line}") for line, band in bands.items()}
     p1, p2 = (_crossing(lines.get(line), lines.get("T1"), height_m, fit) for line in ("L1", "L2"))
-    message = ""
+    message, error = "", None
     if p1 and p2 and p1_p2_m is not None and p1.world_m is not None and p2.world_m is not None:
         distance_m = float(np.linalg.norm(p1.world_m - p2.world_m))
-        message = f"P1-P2 measures {distance_m:.3f} m; {p1_p2_m:.3f} m is given."
-    return TargetPreview(lines, np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2)), p1, p2, message)
+        message = f"P1–P2 measures {distance_m:.3f} m; {p1_p2_m:.3f} m is given."
+        error = distance_m / p1_p2_m - 1.0
+    return TargetPreview(lines, np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2)), p1, p2, message, error)
 
 
 def band_outline(band: Band) -> Floats:

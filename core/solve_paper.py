@@ -146,7 +146,7 @@ def _scale(target: Target, reference: ReferenceFit, places: Floats) -> float:
         return float(1.0 - target.height_m / reference.pose.centre_m[2])
     raise InputError(
         f'project.json: targets.{target.name}.p1_p2_m is missing; "paper" takes its scale from the known distance '
-        "P1-P2, or from height_m and a lens."
+        "P1–P2, or from height_m and a lens."
     )
 
 

@@ -241,4 +241,4 @@ def _previewed(seen: TargetPreview) -> dict[str, Any]:
         "points_raw": points(seen.points_raw),
         "region_raw": points(seen.region_raw),
     }
-    return {"lines": lines, **ends, **patches, "message": seen.message}
+    return {"lines": lines, **ends, **patches, "message": seen.message, "p1_p2_error": seen.p1_p2_error}

@@ -270,9 +270,7 @@ def finish_calibration(here: Context) -> Finish:
 
 
 @router.get("/projects/{project_id}/lens/report")
-def lens_report(folder: Folder) -> dict[str, Any]:
-    """Return the report of the last calibration."""
+def lens_report(folder: Folder) -> dict[str, Any] | None:
+    """Return the report of the last calibration, or null where no lens has been calibrated in this project."""
     report = read_json(folder.results / REPORT_FILE)
-    if not isinstance(report, dict):
-        raise Missing("No lens has been calibrated in this project; send checkerboard pictures first.")
-    return report
+    return report if isinstance(report, dict) else None

@@ -123,11 +123,13 @@ def results(folder: Folder, here: Here) -> dict[str, Any]:
     project = folder.load().project
     state = outcome.state_of(folder, project)
     methods = here.outcomes.methods(folder, project)
+    measured = project.method in methods
     if state.summary is not None and state.summary["method"] not in methods:
         methods.append(state.summary["method"])
     return {
         "ready": state.ready,
         "stale": state.stale,
+        "measured": measured,
         "summary": state.summary,
         "targets": list(state.summary["targets"]) if state.summary else [],
         "methods": methods,

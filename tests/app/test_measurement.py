@@ -182,6 +182,17 @@ def test_what_is_solved_rests_on_the_inputs_of_the_very_project_asked_for(tracke
         assert found.inputs.lens.focal_px == pytest.approx(focal_px)
 
 
+def test_a_filter_that_is_not_applied_makes_nothing_stale(tracked: TestClient) -> None:
+    state = tracked.get(CLIP).json()
+    for drift, stale in (({"corner_hz": 0.4, "order": 6}, False), ({"filter": "high-pass"}, True)):
+        project = state["project"] | {"drift": state["project"]["drift"] | drift}
+        edit = {"project": project, "revision": state["revision"], "label": "drift"}
+        changed = tracked.put(CLIP, json=edit).json()
+        assert tracked.get(f"{CLIP}/results").json()["stale"] == stale
+        assert (changed["steps"]["export"]["status"] == "stale") == stale
+        state = tracked.post(f"{CLIP}/undo", json={"revision": changed["revision"]}).json()
+
+
 def test_the_scene_shows_camera_and_roof_lines_in_step_with_a_frame(tracked: TestClient) -> None:
     scene = tracked.app.state.context.scene  # type: ignore[attr-defined]
     tall = {"frame": 14, "exaggeration": 10.0}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -16,7 +15,7 @@ from playwright.sync_api import APIResponse, Page, Route, expect
 from core.lens import read_lens
 from core.project import read_project
 from tests.browser.hands import centre_of, fitted, zoomed
-from tests.browser.live import SAMPLE, ask, ask_bytes, eventually, free_port, serving, watched
+from tests.browser.live import SAMPLE, ask, ask_bytes, eventually, watched
 from tests.browser.steps import (
     FRAME_SIZE,
     draw_bands,
@@ -36,28 +35,6 @@ WITHIN_PX = 0.5
 CLICK_PX = 0.15
 # Grey levels: corners drawn on a plain surface scatter by less, the squares of a board by more.
 BLANK_LEVELS = 35
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    """A workspace and the address of the server over it."""
-    workspace = tmp_path_factory.mktemp("workspace")
-    shutil.copytree(SAMPLE, workspace / "footage", ignore=shutil.ignore_patterns("project.json", "results"))
-    with serving(workspace, free_port()) as address:
-        yield workspace, address
-
-
-@pytest.fixture
-def project(server, request):
-    """The sample as a project of its own for each test: its folder and its pages' address."""
-    workspace, address = server
-    name = re.sub(r"[^a-z0-9]+", "-", request.node.name)[-40:].strip("-")
-    folder = workspace / name
-    folder.mkdir()
-    document = json.loads((SAMPLE / "project.json").read_text())
-    document["inputs"] = {"video": "../footage/video.mp4", "lens": "../footage/lens.yaml"}  # no cloud: nothing to read
-    (folder / "project.json").write_text(json.dumps(document))
-    return folder, f"{address}/p/{name}"
 
 
 @pytest.fixture(scope="module")
@@ -317,16 +294,37 @@ def test_points_go_to_qgis_and_come_back(browser, project, tmp_path):
         first = file.read_text().splitlines()[1].split(",")
         u, v = before[0].frame_px
         assert [float(cell) for cell in first[:5]] == pytest.approx([*before[0].ground_m, u + 0.5, -(v + 0.5), 1])
+        import_points(page, file)
+        expect(
+            page.get_by_role("status").filter(has_text="All 20 pairs of clicks.points are here already")
+        ).to_be_visible()
+        lines = file.read_text().splitlines()
+        east, rest = lines[-1].split(",", 1)
+        file.write_text("\n".join([*lines[:-1], f"{float(east) + 1},{rest}"]) + "\n")  # one of them elsewhere
+        import_points(page, file)
+        page.get_by_role("dialog").get_by_role("button", name="Add 1 pair").click()
+        expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(21)
+        file.write_text("\n".join(lines[:10]) + "\n")
         page.get_by_role("button", name="Import and export").click()
-        with page.expect_file_chooser() as chooser:
-            page.get_by_role("menuitem", name="Import").click()
-        chooser.value.set_files(file)
-        expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(40)
+        page.get_by_role("menuitem", name="Delete all pairs").click()
+        import_points(page, file)
+        expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(9)
+        file.write_text("\n".join(lines) + "\n")
+        import_points(page, file)
+        expect(page.get_by_role("dialog")).to_contain_text("9 of them are here already")
+        page.get_by_role("dialog").get_by_role("button", name="Replace the 9 pairs here").click()
+        expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(20)
         saved(page)
     after = read_project(folder).correspondences
-    assert np.array([pair.frame_px for pair in after[20:]]) == pytest.approx(
-        np.array([pair.frame_px for pair in before])
-    )
+    assert np.array([pair.frame_px for pair in after]) == pytest.approx(np.array([pair.frame_px for pair in before]))
+
+
+def import_points(page: Page, file) -> None:
+    """Choose a file of pairs from the menu."""
+    page.get_by_role("button", name="Import and export").click()
+    with page.expect_file_chooser() as chooser:
+        page.get_by_role("menuitem", name="Import").click()
+    chooser.value.set_files(file)
 
 
 def test_regions_and_bands_are_drawn_and_previewed_as_the_engine_sees_them(browser, project, truth):

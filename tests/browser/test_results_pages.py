@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, Response, expect
+from playwright.sync_api import Page, Response, Route, expect
 
 from core.drift import high_pass
 from core.project import read_project
@@ -261,6 +261,29 @@ def test_the_corner_slider_shows_what_the_engine_filters(browser, project):
         eventually(lambda: read_project(folder).drift.corner_hz == pytest.approx(corner))
 
 
+def test_nothing_of_another_corner_stands_beside_the_new_one(browser, project):
+    _, pages = project
+    held: list[Route] = []
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/drift")
+        expect(page.locator(".warnings")).not_to_be_empty()
+        expect(page.locator(".drift-lower .plot-playhead").first).to_be_visible()
+        page.route("**/drift", lambda route: route.continue_() if held else held.append(route))
+        line = page.locator(".drift-lower .plot-playhead").first
+        before = line.bounding_box()["x"]
+        page.get_by_role("slider", name="Corner frequency").focus()
+        page.keyboard.press("ArrowRight")
+        expect(page.locator(".figures")).to_have_class(re.compile("awaited"))
+        expect(page.locator(".warnings")).to_have_class(re.compile("awaited"))
+        expect(page.get_by_role("status").filter(has_text="Solving…")).to_be_visible()
+        assert line.bounding_box()["x"] > before
+        for route in held[:]:
+            route.continue_()
+        page.unroute("**/drift")
+        expect(page.locator(".figures")).not_to_have_class(re.compile("awaited"))
+        expect(page.get_by_role("status").filter(has_text="Solving…")).to_be_hidden()
+
+
 def asks_for(answer: Response, corner: float) -> bool:
     return json.loads(answer.request.post_data)["corner_hz"] == pytest.approx(corner)
 
@@ -315,3 +338,31 @@ def test_table_2_says_what_the_summary_says(browser, scene, finished):
             ):
                 assert float(shown) == pytest.approx(100 * exact, abs=0.0051)
         expect(page.get_by_label("GPS", exact=True)).to_contain_text(f"{1000 * gps['rms_m']['x']:.1f}")
+
+
+def test_a_result_from_before_a_change_says_so(browser, project):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    peak = json.loads((folder / "results" / "summary.json").read_text())["targets"]["roof"]["peak_negative_m"]["x"]
+    first = round(peak["time_s"] * 30) - 2
+    (folder / "project.json").write_text(json.dumps(document | {"excluded_frames": [[first, first + 4]]}))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/export")
+        table = page.get_by_label("Peaks and residual")
+        expect(table.locator(".note")).to_contain_text("5 frames of the event excluded or lost", timeout=60_000)
+        expect(page.get_by_text("from before the change")).to_have_count(0)  # solved anew, as the project stands
+    document["targets"][0]["lines"]["L1"]["width_m"] += 0.01
+    refused: list[str] = []
+    for change in ({}, {"method": "paper"}):
+        (folder / "project.json").write_text(json.dumps(document | change))
+        with watched(browser, pages) as page:
+            page.on("response", lambda answer: refused.append(answer.url) if answer.status >= 400 else None)
+            page.goto(f"{pages}/track")
+            expect(page.get_by_role("button", name="Update results")).to_be_visible()
+            page.goto(f"{pages}/export")
+            expect(page.get_by_role("status").filter(has_text="from before the change")).to_be_visible()
+            expect(page.get_by_role("link", name="Go to Track")).to_be_visible()
+            expect(page.locator(".export-overlay .plot-legend")).to_contain_text("P1")
+            expect(page.locator(".comparison tbody tr").first).to_contain_text("East")
+            expect(page.get_by_role("alert")).to_have_count(0)
+    assert refused == []  # what is not there yet is a state, not an error

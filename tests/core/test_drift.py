@@ -218,6 +218,8 @@ def test_a_residual_that_drift_hides_is_seen_where_the_displacement_is_free_of_d
     assert filter_warnings(moved, filtered, time_s, INTERVALS, corner_hz=0.25) == []
     (warning,) = filter_warnings(moved, filtered, time_s, INTERVALS, corner_hz=0.25, steady_m=steady)
     assert "removes the residual displacement: along x (east) 8.5 cm by the geometric method and " in warning
+    (mirrored,) = filter_warnings(-moved, -filtered, time_s, INTERVALS, corner_hz=0.25, steady_m=-steady)
+    assert "along x (east) \u22128.5 cm" in mirrored
 
 
 def test_warns_of_a_pre_event_shorter_than_a_period() -> None:

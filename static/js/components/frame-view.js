@@ -87,7 +87,7 @@ export class FrameView extends Emitter {
     this.#showOverlay();
   }
 
-  /** Not needed while only the 3-D scene is seen. @param {boolean} active */
+  /** Not needed while only the 3D scene is seen. @param {boolean} active */
   setActive(active) {
     this.active = active;
     void this.#load();

@@ -31,7 +31,8 @@ import { get, projectPath } from "../lib/api.js";
  *
  * @typedef {object} Results
  * @property {boolean} ready
- * @property {boolean} stale
+ * @property {boolean} stale the project has changed since the files were made
+ * @property {boolean} measured the whole video, as the project wants it now; else there is only what was before a change
  * @property {any} summary the engine's summary.json
  * @property {string[]} targets
  * @property {Method[]} methods

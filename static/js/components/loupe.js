@@ -24,6 +24,7 @@ export class Loupe {
     pane.element.append(this.element);
     pane.on("hover", ({ point }) => this.show(point));
     pane.on("drag", ({ point }) => this.show(point));
+    pane.on("picture", () => this.show(this.#point));
   }
 
   /** @param {boolean} enabled */

@@ -1,6 +1,8 @@
 // A number with its unit: typed, or stepped with the arrow keys (Shift ten times, Alt a tenth).
 
 import { h } from "../lib/dom.js";
+import { fixed } from "../lib/format.js";
+import { fieldWords } from "./field-words.js";
 
 /**
  * @typedef {object} NumberFieldOptions
@@ -11,7 +13,8 @@ import { h } from "../lib/dom.js";
  * @property {number} [decimals]
  * @property {number} [step]
  * @property {number} [min]
- * @property {number} [max]
+ * @property {number | (() => number)} [max]  a function where it is known later
+ * @property {() => string} [tooGreat]  what to say of a greater one
  * @property {boolean} [optional]  may be empty (null)
  * @property {boolean} [compact]
  * @property {boolean} [bare]  without the visible label (it is still spoken)
@@ -23,11 +26,15 @@ let fields = 0;
 
 /** @param {NumberFieldOptions} options */
 export function numberField(options) {
-  const { onChange, decimals = 2, step = 10 ** -decimals, min = -Infinity, max = Infinity, optional = false } = options;
+  const { unit, onChange, decimals = 2, step = 10 ** -decimals, min = -Infinity, optional = false } = options;
+  const greatest = () => (typeof options.max === "function" ? options.max() : (options.max ?? Infinity));
   const input = inputOf(options);
+  const words = fieldWords(input);
   let current = options.value;
 
   const written = () => (current === null ? "" : current.toFixed(decimals));
+  const refuse = (/** @type {number} */ value) =>
+    words.say(options.tooGreat && value > greatest() ? options.tooGreat() : permitted(min, greatest(), decimals, unit));
   const show = () => {
     input.value = written();
     input.removeAttribute("aria-invalid");
@@ -42,13 +49,18 @@ export function numberField(options) {
     const text = plainNumber(input.value);
     if (text === "" && optional) return take(null);
     const value = Number(text);
-    if (text === "" || !Number.isFinite(value) || value < min || value > max)
-      return input.setAttribute("aria-invalid", "true");
+    if (text === "" || !Number.isFinite(value) || value < min || value > greatest()) {
+      input.setAttribute("aria-invalid", "true");
+      return refuse(value);
+    }
     if (current !== null && text === written()) return show(); // as rounded for the eye: nothing was typed
     take(value);
   };
-  const turn = (/** @type {number} */ steps) =>
-    take(Math.min(max, Math.max(min, Number(((current ?? 0) + steps * step).toFixed(8)))));
+  const turn = (/** @type {number} */ steps) => {
+    const wanted = Number(((current ?? 0) + steps * step).toFixed(8));
+    take(Math.min(greatest(), Math.max(min, wanted)));
+    if (wanted !== current) refuse(wanted);
+  };
   input.addEventListener("change", read);
   input.addEventListener("blur", show); // after "change": what could not be used, or what came meanwhile
   input.addEventListener("keydown", (event) => {
@@ -61,7 +73,7 @@ export function numberField(options) {
   });
   show();
   return {
-    element: framed(input, options),
+    element: framed(input, words.element, options),
     input,
     /** Show another value, unless a person is typing. @param {number | null} value */
     set(value) {
@@ -87,9 +99,15 @@ function inputOf({ label, unit, placeholder, optional = false, bare = false }) {
   });
 }
 
-/** With its unit, and with its label unless bare. @param {HTMLInputElement} input @param {NumberFieldOptions} options */
-function framed(input, { label, unit, compact, bare, hint }) {
-  const box = h("div", { class: `number-field ${compact ? "compact" : ""}` }, input, h("span", { class: "unit" }, unit));
+/**
+ * With its unit and what is said of it, and with its label unless bare.
+ * @param {HTMLInputElement} input
+ * @param {HTMLElement} words
+ * @param {NumberFieldOptions} options
+ */
+function framed(input, words, { label, unit, compact, bare, hint }) {
+  const unitBox = h("span", { class: "unit" }, unit);
+  const box = h("div", { class: `number-field ${compact ? "compact" : ""}` }, input, words, unitBox);
   if (bare) return box;
   return h(
     "div",
@@ -107,4 +125,12 @@ const plainNumber = (text) => text.trim().replace(",", ".").replace("\u2212", "-
 function stepsOf({ key, shiftKey, altKey }) {
   const way = key === "ArrowUp" ? 1 : key === "ArrowDown" ? -1 : 0;
   return way * (shiftKey ? 10 : altKey ? 0.1 : 1);
+}
+
+/** What a field takes, in words. @param {number} min @param {number} max @param {number} decimals @param {string} unit */
+function permitted(min, max, decimals, unit) {
+  const [least, most] = [min, max].map((value) => fixed(value, value % 1 === 0 ? 0 : decimals));
+  const range = Number.isFinite(min) && Number.isFinite(max) ? `from ${least} to ${most}` : "";
+  const half = Number.isFinite(min) ? `of at least ${least}` : Number.isFinite(max) ? `of at most ${most}` : "";
+  return ["A number", range || half, range || half ? unit : ""].filter(Boolean).join(" ") + ", please.";
 }

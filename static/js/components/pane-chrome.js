@@ -14,6 +14,7 @@ import { fixed } from "../lib/format.js";
 export function paneChrome(pane, { title, readout }) {
   const name = h("span", { class: "pane-chip" }, title);
   const hint = h("span", { class: "pane-chip attention", hidden: true, role: "status" });
+  const legend = h("span", { class: "pane-chip legend", hidden: true });
   const place = h("div", { class: "pane-readout", "aria-hidden": "true" });
   const note = h("div", { class: "pane-note", hidden: true });
   const tool = (
@@ -27,7 +28,7 @@ export function paneChrome(pane, { title, readout }) {
     tool("zoom_in", "Zoom in (+)", () => pane.zoom(1.6)),
     tool("fit", "Whole picture (0)", () => pane.fit()),
   );
-  pane.element.append(h("div", { class: "pane-caption" }, name, hint), place, tools, note);
+  pane.element.append(h("div", { class: "pane-caption" }, name, legend, hint), place, tools, note);
 
   const show = () => {
     const zoom = `${fixed(pane.view.scale * 100, pane.view.scale < 0.1 ? 1 : 0)} %`;
@@ -47,6 +48,11 @@ export function paneChrome(pane, { title, readout }) {
     setHint(words) {
       hint.hidden = words === "";
       hint.textContent = words;
+    },
+    /** What is drawn over the picture, and how; empty hides. @param {string} words */
+    setLegend(words) {
+      legend.hidden = words === "";
+      legend.textContent = words;
     },
     /** Instead of a picture. @param {...(Node | string)} content none hides */
     setNote(...content) {

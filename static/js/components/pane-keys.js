@@ -1,4 +1,4 @@
-// Keys every image pane answers to while it has the focus.
+// Keys every image pane answers to while it has the focus; where none has, the one a person works in may answer.
 
 /** @typedef {import("./pane.js").Pane} Pane */
 /** @typedef {import("../lib/keys.js").KeyBinding} KeyBinding */
@@ -17,14 +17,24 @@ const arrowsWith = (prefix) =>
 /** Direction of an arrow key: u right, v down. @param {KeyboardEvent} event */
 export const arrowDirection = (event) => DIRECTIONS[event.key];
 
+/** The pane with the focus, else the one under the pointer, else the one used last. @param {Pane[]} panes */
+export const activePane = (panes) =>
+  panes.find((pane) => pane.hasFocus) ??
+  panes.find((pane) => pane.cursor !== null) ??
+  panes.reduce((last, pane) => (pane.usedAt > last.usedAt ? pane : last), panes[0]);
+
+/** The pane with the focus. @param {Pane[]} panes */
+const focusedPane = (panes) => panes.find((pane) => pane.hasFocus);
+
 /**
  * Zoom, fit and pan of the focused pane.
  * @param {Pane[]} panes
- * @param {{canPan?: () => boolean}} [options]  canPan: false while arrows nudge something
+ * @param {{canPan?: () => boolean, chosen?: (panes: Pane[]) => Pane | undefined}} [options]  canPan: false while arrows
+ *   nudge something; chosen: which pane answers
  * @returns {KeyBinding[]}
  */
-export function paneKeys(panes, { canPan = () => true } = {}) {
-  const focused = () => panes.find((pane) => pane.hasFocus);
+export function paneKeys(panes, { canPan = () => true, chosen = focusedPane } = {}) {
+  const focused = () => chosen(panes);
   const has = () => focused() !== undefined;
   const pan = (/** @type {KeyboardEvent} */ event) => {
     const [u, v] = arrowDirection(event);
@@ -52,25 +62,20 @@ export function paneKeys(panes, { canPan = () => true } = {}) {
 }
 
 /**
- * Nudging of what is selected, in the focused pane: 0.1, with Shift 1, with Alt 0.02 image px.
+ * Nudging of what is selected, in the active pane: 0.1, with Shift 1, with Alt 0.02 image px.
  * @param {Pane[]} panes
  * @param {{what: string, when: (pane: Pane) => boolean, nudge: (pane: Pane, delta: import("../lib/types.js").Point) => void}} options
  * @returns {KeyBinding[]}
  */
 export function nudgeKeys(panes, { what, when, nudge }) {
-  const focused = () => panes.find((pane) => pane.hasFocus);
   const binding = (/** @type {string} */ prefix, /** @type {number} */ step) => ({
     keys: arrowsWith(prefix),
     group: "Placing",
     label: `Nudge ${what} by ${step} px`,
-    when: () => {
-      const pane = focused();
-      return pane !== undefined && when(pane);
-    },
+    when: () => when(activePane(panes)),
     run: (/** @type {KeyboardEvent} */ event) => {
       const [u, v] = arrowDirection(event);
-      const pane = focused();
-      if (pane) nudge(pane, [u * step, v * step]);
+      nudge(activePane(panes), [u * step, v * step]);
     },
   });
   return [binding("", 0.1), binding("Shift+", 1), binding("Alt+", 0.02)];

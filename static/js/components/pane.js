@@ -22,6 +22,7 @@ import { ShapeLayer, shapeAt } from "./shapes.js";
  * @property {{point: Point | null, id: string | null}} hover
  * @property {{point: Point, id: string | null}} doubleclick
  * @property {View} view
+ * @property {PaneImage | null} picture  another one is shown
  */
 
 const STILL_PX = 3;
@@ -36,6 +37,8 @@ export class Pane extends Emitter {
   #shapes = [];
   /** @type {string | null} */
   #hot = null;
+  /** @type {Point | null} CSS px, where the pointer is */
+  #at = null;
   #drawing = 0;
   #lastClick = { time: 0, at: /** @type {Point} */ ([0, 0]) };
   /** @type {{at: Point, last: Point, moved: boolean, shape: Shape | null, from: Point, pointer: number} | null} */
@@ -60,6 +63,8 @@ export class Pane extends Emitter {
     this.size = [element.clientWidth || 1, element.clientHeight || 1];
     /** @type {Point | null} image px under the pointer */
     this.cursor = null;
+    /** When it last had the focus; of several, keys go to the newest. */
+    this.usedAt = 0;
     this.#fitted = false;
     element.classList.add("pane");
     element.classList.toggle("view-only", viewOnly);
@@ -101,6 +106,8 @@ export class Pane extends Emitter {
     this.image = image;
     this.element.dataset.picture = image === null ? "" : `${image.width}x${image.height}`;
     if (image !== null && !same) this.fit();
+    if (this.#at !== null) this.#hover(this.#at, shapeAt(this.#shapes, this.view, this.#at));
+    this.emit("picture", image);
     this.invalidate();
   }
 
@@ -235,6 +242,7 @@ export class Pane extends Emitter {
     element.addEventListener("pointercancel", () => this.#giveUp());
     element.addEventListener("lostpointercapture", () => this.#giveUp());
     element.addEventListener("pointerleave", () => this.#hover(null, null));
+    element.addEventListener("focus", () => (this.usedAt = performance.now()));
     element.addEventListener("keydown", (event) => {
       if (event.key === "Escape" && this.isDragging) {
         event.preventDefault();
@@ -315,6 +323,7 @@ export class Pane extends Emitter {
   /** @param {Point | null} at CSS px @param {Shape | null} shape */
   #hover(at, shape) {
     const id = shape?.id ?? null;
+    this.#at = at;
     this.cursor = at === null ? null : this.view.toImage(at);
     if (id !== this.#hot) {
       this.#hot = id;

@@ -136,6 +136,13 @@ export class Plot extends Emitter {
     this.place();
   }
 
+  /** Draw a curve faint that holds no longer, or fully again. @param {string} label @param {boolean} faint */
+  setFaint(label, faint) {
+    const series = this.u.series.find((entry) => entry.label === label);
+    if (series) series.alpha = faint ? 0.3 : 1;
+    this.u.redraw(false);
+  }
+
   /** @param {Interval[]} intervals */
   setIntervals(intervals) {
     this.intervals = intervals;
@@ -242,8 +249,10 @@ export class Plot extends Emitter {
   axisX() {
     const ink = () => this.colour("--plot-axis");
     const unit = this.options.xUnit ?? "s";
-    const values = (/** @type {uPlot} */ _, /** @type {number[]} */ ticks) =>
-      ticks.map((tick, i) => (tick == null ? "" : i === ticks.length - 1 ? `${round(tick)} ${unit}` : round(tick)));
+    const values = (/** @type {uPlot} */ _, /** @type {number[]} */ ticks) => {
+      const last = ticks.findLastIndex((tick) => tick != null); // a logarithmic axis writes only some of its ticks
+      return ticks.map((tick, i) => (tick == null ? "" : i === last ? `${round(tick)} ${unit}` : round(tick)));
+    };
     return {
       stroke: ink,
       size: 30,

@@ -1,4 +1,4 @@
-// The 3-D scene beside the player: camera, frame and roof lines in step with it, motion exaggerated on request.
+// The 3D scene beside the player: camera, frame and roof lines in step with it, motion exaggerated on request.
 
 import { post, projectPath, sentence } from "../lib/api.js";
 import { fill, h } from "../lib/dom.js";
@@ -48,7 +48,7 @@ export class SceneView {
       this.host.prepend(
         h("iframe", {
           class: "scene-frame",
-          title: "3-D scene: cloud, camera and roof lines",
+          title: "3D scene: cloud, camera and roof lines",
           src: "/viser/?hideViserLogo",
         }),
       );

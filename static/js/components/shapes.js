@@ -9,17 +9,25 @@ import { distance, distanceToSegment, isInside } from "../lib/coordinates.js";
 /**
  * @typedef {object} Shape
  * @property {string} id  unique in its pane
- * @property {"mark" | "handle" | "polygon" | "polyline" | "arrow"} kind
- * @property {Point[]} points  image px; a mark or handle has one, an arrow two (tail, head)
+ * @property {"mark" | "handle" | "aim" | "polygon" | "polyline" | "arrow"} kind
+ * @property {Point[]} points  image px; a mark, handle or aim has one, an arrow two (tail, head)
  * @property {string} [class]  "selected", "off", "ghost", "pending", "moving", "l1", "l2", "t1", "corner-point", "dashed", "thin", "empty"
  * @property {string} [label]  drawn beside a mark, or at the first point of a line
  * @property {boolean} [grab]  can be selected and dragged; polygons also by their inside
  */
 
-const GRAB_RADIUS = { mark: 14, handle: 13, arrow: 0, polyline: 8, polygon: 7 };
+const GRAB_RADIUS = { mark: 14, handle: 13, aim: 0, arrow: 0, polyline: 8, polygon: 7 };
 const MARK = "M-11 0H-3.5M3.5 0H11M0-11V-3.5M0 3.5V11M6.5 0a6.5 6.5 0 1 1-13 0 6.5 6.5 0 1 1 13 0";
+const AIM = "M-16 0H-5M5 0H16M0-16V-5M0 5V16";
 const HANDLE = "M4.5 0a4.5 4.5 0 1 1-9 0 4.5 4.5 0 1 1 9 0";
 const HANDLE_CORE = "M2.5 0a2.5 2.5 0 1 1-5 0 2.5 2.5 0 1 1 5 0";
+
+/** What lies at one point, of one size at any zoom. @type {Partial<Record<Shape["kind"], {halo: string, ink: string}>>} */
+const OUTLINES = {
+  mark: { halo: MARK, ink: MARK },
+  handle: { halo: HANDLE, ink: HANDLE_CORE },
+  aim: { halo: AIM, ink: AIM },
+};
 
 /** The SVG elements of a pane's shapes, made once per id and moved afterwards. */
 export class ShapeLayer {
@@ -32,14 +40,18 @@ export class ShapeLayer {
 
   /** @param {Shape[]} shapes @param {View} view @param {string | null} hot id under the pointer */
   draw(shapes, view, hot) {
-    const gone = new Set(this.#drawn.keys());
-    for (const shape of shapes) {
-      gone.delete(shape.id);
-      this.#place(shape, view, shape.id === hot);
-    }
-    for (const id of gone) {
-      this.#drawn.get(id)?.group.remove();
+    const wanted = new Set(shapes.map((shape) => shape.id));
+    for (const [id, { group }] of this.#drawn) {
+      if (wanted.has(id)) continue;
+      group.remove();
       this.#drawn.delete(id);
+    }
+    let next = this.element.firstElementChild;
+    for (const shape of shapes) {
+      this.#place(shape, view, shape.id === hot);
+      const { group } = this.#parts(shape.id);
+      if (group === next) next = next.nextElementSibling;
+      else this.element.insertBefore(group, next); // later shapes lie on top, whichever was made first
     }
   }
 
@@ -53,7 +65,6 @@ export class ShapeLayer {
       const group = svg("g", { "data-id": id }, halo, ink, text);
       parts = { group, halo, ink, text };
       this.#drawn.set(id, parts);
-      this.element.append(group);
     }
     return parts;
   }
@@ -61,14 +72,15 @@ export class ShapeLayer {
   /** @param {Shape} shape @param {View} view @param {boolean} hot */
   #place(shape, view, hot) {
     const { group, halo, ink, text } = this.#parts(shape.id);
-    const isPoint = shape.kind === "mark" || shape.kind === "handle";
+    const outline = OUTLINES[shape.kind];
+    const isPoint = outline !== undefined;
     const family = isPoint || shape.kind === "arrow" ? "" : "line";
     group.setAttribute("class", `${shape.kind} ${family} ${shape.class ?? ""} ${hot ? "hot" : ""}`);
     const canvas = shape.points.map((point) => view.toCanvas(point));
     if (isPoint) {
       group.setAttribute("transform", `translate(${canvas[0][0]} ${canvas[0][1]})`);
-      halo.setAttribute("d", shape.kind === "mark" ? MARK : HANDLE);
-      ink.setAttribute("d", shape.kind === "mark" ? MARK : HANDLE_CORE);
+      halo.setAttribute("d", outline.halo);
+      ink.setAttribute("d", outline.ink);
     } else {
       const path =
         shape.kind === "arrow" ? arrowPath(canvas[0], canvas[1]) : linePath(canvas, shape.kind === "polygon");

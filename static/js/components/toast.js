@@ -1,4 +1,4 @@
-// Short messages at the bottom, and a voice for screen readers.
+// Short messages under the header, and a voice for screen readers.
 
 import { h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
@@ -32,6 +32,9 @@ export function toast(message, { tone = "info", action, seconds = tone === "bad"
       icon("close", "small"),
     ),
   );
+  element.dataset.message = `${tone}: ${message}`;
+  for (const older of /** @type {HTMLElement[]} */ ([...tray.children]))
+    if (older.dataset.message === element.dataset.message) older.remove(); // said once, and for as long again
   tray.append(element);
   if (seconds > 0) hideAfter(element, seconds);
   makeRoom();

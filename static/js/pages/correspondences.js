@@ -8,18 +8,19 @@ import { fixed, plural } from "../lib/format.js";
 import { latest } from "../lib/latest.js";
 import { setView, viewNumber, viewText } from "../lib/view-state.js";
 import { PaneImage } from "../components/pane-image.js";
-import { nudgeKeys, paneKeys } from "../components/pane-keys.js";
+import { activePane, nudgeKeys, paneKeys } from "../components/pane-keys.js";
 import { menuButton } from "../components/menu.js";
 import { numberField } from "../components/number-field.js";
 import { openPage } from "../components/page.js";
 import { announce, toast, toastError } from "../components/toast.js";
 import { toggleButton } from "../components/toggle-button.js";
+import { askAboutImport, askAboutPairs } from "./correspondences/ask-about-pairs.js";
 import { fitPanel } from "./correspondences/fit-panel.js";
 import { compareControls } from "./correspondences/compare.js";
 import { linkedViews } from "./correspondences/linked-views.js";
-import { PairPane, halvesWithout, identity } from "./correspondences/pair-pane.js";
+import { ARROW_PX, PairPane, halvesWithout, identity } from "./correspondences/pair-pane.js";
 import { lengthOf, pairsTable } from "./correspondences/pairs-table.js";
-import { pairsFromPoints, pointsText } from "./correspondences/points-file.js";
+import { notAmong, pairsFromPoints, pointsText } from "./correspondences/points-file.js";
 import { Slots, otherSide } from "./correspondences/slots.js";
 import { selectionPanel } from "./correspondences/selection-panel.js";
 import { transformer, undistortion } from "./correspondences/transform.js";
@@ -55,6 +56,7 @@ let fit = NO_FIT;
 let linked = viewText("linked") === "1";
 let undistorted = viewText("und") === "1";
 let arrows = true;
+let lastFrame = Infinity; // until the video is known
 
 // --- the two panes
 
@@ -77,6 +79,7 @@ const ortho = new PairPane(h("div"), slots, {
 const sides = /** @type {[PairPane, PairPane]} */ ([frame, ortho]);
 const panes = sides.map((side) => side.pane);
 const focused = () => sides.find((side) => side.pane.hasFocus) ?? null;
+const sideOf = (/** @type {import("../components/pane.js").Pane} */ pane) => sides.find((side) => side.pane === pane);
 /** @param {Point} place */
 const placeWords = (place) => place.map((value) => fixed(value, 2)).join(", ");
 
@@ -120,6 +123,8 @@ function showFit() {
   ortho.residuals = residuals(({ ground_m }, { predicted_m }) =>
     grid === null ? null : subtract(orthoFromWorld(grid, predicted_m), orthoFromWorld(grid, ground_m)),
   );
+  // as long for as many metres as in the frame
+  if (grid !== null && fit.rms_px && fit.rms_m) ortho.arrowPx = (ARROW_PX * grid.pixel_size_m * fit.rms_px) / fit.rms_m;
   sides.forEach((side) => side.draw());
   void findGhosts();
 }
@@ -154,6 +159,8 @@ function goTo(id) {
   if (id === null) return;
   slots.select(id);
   for (const side of sides) side.goTo(id, REFINE_SCALE);
+  const inTable = document.activeElement?.matches("#pairs tr:focus-visible") ?? false; // moving through it by keys
+  if (!inTable) sideOf(activePane(panes))?.focus();
 }
 
 /** @param {number} step */
@@ -221,10 +228,10 @@ const referenceFrame = numberField({
   decimals: 0,
   step: 1,
   min: 0,
+  max: () => lastFrame,
   compact: true,
   bare: true,
-  onChange: (value) =>
-    void store.edit(`Reference frame ${value}`, (draft) => void (draft.reference_frame = value ?? 0)),
+  onChange: (value) => void chooseReferenceFrame(value ?? 0),
 });
 referenceFrame.element.classList.add("narrow");
 find("#tools").append(
@@ -252,29 +259,48 @@ find("#tools").append(
         icon: "trash",
         danger: true,
         disabled: slots.pairs.length === 0,
-        run: () => void store.edit("Delete all pairs", (draft) => void (draft.correspondences = [])),
+        run: () => slots.removeAll(),
       },
     ],
   }),
 );
 find("#panes").append(...panes.map((pane) => pane.element));
 
+/** Pairs were clicked in one frame of the video; in another one their places may show something else. @param {number} wanted */
+async function chooseReferenceFrame(wanted) {
+  const set = (/** @type {import("../lib/types.js").Project} */ draft) => void (draft.reference_frame = wanted);
+  const clicked = slots.pairs.length + slots.halves.length;
+  const choice = clicked === 0 ? "keep" : await askAboutPairs(clicked, store.project.reference_frame, wanted);
+  if (choice === "keep") await store.edit(`Reference frame ${wanted}`, set);
+  else if (choice === "delete") slots.removeAll(`Reference frame ${wanted}, pairs deleted`, set);
+  else referenceFrame.set(store.project.reference_frame);
+}
+
 async function importPoints() {
   const [file] = await pickFiles({ accept: ".points,.csv,.txt" });
   if (file === undefined) return;
   try {
-    const imported = pairsFromPoints(await file.text(), file.name);
+    const read = pairsFromPoints(await file.text(), file.name);
+    const fresh = notAmong(read, slots.pairs);
+    if (fresh.length === 0) return void toast(`All ${plural(read.length, "pair")} of ${file.name} are here already.`);
+    const counts = { now: slots.pairs.length, read: read.length, fresh: fresh.length };
+    const choice = counts.now === 0 ? "add" : await askAboutImport(file.name, counts);
+    if (choice === null) return;
+    const imported = choice === "add" ? fresh : read;
     await store.edit(`Import ${plural(imported.length, "pair")}`, (draft) => {
+      if (choice === "replace") draft.correspondences = [];
       const first = Math.max(0, ...draft.correspondences.map((pair) => pair.id)) + 1;
       draft.correspondences.push(...imported.map((pair, i) => ({ id: first + i, ...pair })));
     });
-    toast(`${plural(imported.length, "pair")} added from ${file.name}.`, { tone: "good" });
+    toast(`${plural(imported.length, "pair")} taken from ${file.name}.`, { tone: "good" });
   } catch (error) {
     toastError(error);
   }
 }
 
 // --- pictures
+
+void get(projectPath(page.id, "inputs")).then(({ video }) => (lastFrame = (video?.frames || Infinity) - 1), toastError);
 
 /** @param {string} path @param {PairPane} side */
 const loadImage = (path, side) => PaneImage.load(`/api/${path}`, { onLevel: () => side.pane.invalidate() });
@@ -355,7 +381,7 @@ page.keys([
   ...nudgeKeys(panes, {
     what: "the selected mark",
     when: () => hasSelection(),
-    nudge: (_pane, delta) => focused()?.nudge(delta),
+    nudge: (pane, delta) => sideOf(pane)?.nudge(delta),
   }),
   {
     keys: "Delete / Backspace",
@@ -389,9 +415,16 @@ page.keys([
   {
     keys: "Ctrl+Z",
     group: "Pairs",
-    label: "Take back the newest unfinished click first",
+    label: "Take back an unfinished click, where that came last",
     run: () => slots.dropNewestHalf(),
-    when: newestHalf,
+    when: () => slots.isHalfNewest,
+  },
+  {
+    keys: "Ctrl+Shift+Z / Ctrl+Y",
+    group: "Pairs",
+    label: "Bring back the click just taken back",
+    run: () => slots.bringBack(),
+    when: () => slots.isHalfNext,
   },
   { keys: "L", group: "Looking", label: "Link the views", run: linkToggle.toggle },
   { keys: "U", group: "Looking", label: "Raw or undistorted frame", run: undistortToggle.toggle },
@@ -406,7 +439,7 @@ page.keys([
   { keys: "S", group: "Looking", label: "Swipe between the two", run: () => compare.choose("swipe") },
   { keys: "[", group: "Looking", label: "Blend or swipe less", run: () => compare.step(-0.1) },
   { keys: "]", group: "Looking", label: "Blend or swipe more", run: () => compare.step(0.1) },
-  ...paneKeys(panes, { canPan: () => !hasSelection() }),
+  ...paneKeys(panes, { canPan: () => !hasSelection(), chosen: activePane }),
 ]);
 
 // --- flow

@@ -28,6 +28,8 @@ import { toastError } from "../components/toast.js";
 const LOWEST_HZ = 0.05;
 const HIGHEST_HZ = 0.5;
 const CORNER_STEP_HZ = 0.005;
+const FAINT_AFTER_MS = 120; // an answer that is quicker needs no sign
+const TOLD_AFTER_MS = 600;
 
 const page = await openPage("drift");
 const { store } = page;
@@ -46,6 +48,8 @@ let geometric = null;
 let answer = null;
 /** @type {Sweep | null} */
 let sweep = null;
+/** @type {number[]} timers of the signs that an answer is awaited */
+let awaited = [];
 
 // the page
 const mainArea = h("div", { class: "drift-main" });
@@ -107,6 +111,7 @@ const orderField = numberField({
 const kneeButton = h("button", {
   type: "button",
   class: "button small",
+  hidden: true,
   onclick: () => typeCorner(sweep?.knee_hz ?? null),
 });
 const kneeWords = h("p", { class: "small soft" });
@@ -133,8 +138,10 @@ const spectrumPlot = new Plot(lowerArea, {
   logX: true,
   logY: true,
 });
+const filtering = h("span", { class: "badge accent", role: "status", hidden: true }, "Solving…");
+solving.before(filtering);
 const fields = intervalFields(intervalBox, saveInterval);
-const refilter = latest(askFilter, showAnswer, (error) => (opened(), toastError(error)));
+const refilter = latest(askFilter, showAnswer, (error) => (opened(), (filtering.hidden = true), toastError(error)));
 const resweep = latest(askSweep, showSweep, (error) => showSweepProblem(error));
 const respectrum = latest(askSpectra, showSpectra, () => undefined);
 const solver = new Solver(
@@ -263,12 +270,28 @@ async function reload() {
 
 /** Ask for all that depends on target, point, intervals and corner. */
 function ask() {
-  refilter(corner_hz);
+  filterAnew();
   const rest = store.project.intervals_s.pre_event;
   if (rest === null) return showNoInterval();
   if (sweep === null) kneeWords.textContent = "Looking for the knee…";
   resweep(rest);
   respectrum(rest);
+}
+
+/** Until the answer is there, the figures, the curve and the words of the last one are not for this corner. */
+function filterAnew() {
+  if (awaited.length === 0 && answer !== null)
+    awaited = [
+      window.setTimeout(() => setFaint(true), FAINT_AFTER_MS),
+      window.setTimeout(() => (filtering.hidden = false), TOLD_AFTER_MS),
+    ];
+  refilter(corner_hz);
+}
+
+/** @param {boolean} faint */
+function setFaint(faint) {
+  history.setFaint("Filtered", faint);
+  for (const element of [figures, warnings]) element.classList.toggle("awaited", faint);
 }
 
 /** @param {number} corner @returns {Promise<DriftAnswer>} */
@@ -304,6 +327,10 @@ async function askSpectra([start, end]) {
 function showAnswer(newest) {
   answer = newest;
   opened();
+  awaited.forEach(window.clearTimeout);
+  awaited = [];
+  filtering.hidden = true;
+  setFaint(false);
   drawHistory();
   showFigures();
   fill(
@@ -405,7 +432,7 @@ function markCorner() {
       ? [{ at: sweep.knee_hz, label: `knee ${fixed(sweep.knee_hz, 3)} Hz`, colour: "--series-4" }]
       : [];
   sweepPlot.setVerticals([corner, ...knee]);
-  sweepPlot.head = corner_hz;
+  sweepPlot.setPlayHead(corner_hz);
   spectrumPlot.setVerticals([corner]);
 }
 
@@ -429,7 +456,7 @@ function moveCorner(wanted_hz) {
   slider.setAttribute("aria-valuetext", `${fixed(wanted_hz, 3)} hertz`);
   cornerField.set(wanted_hz);
   markCorner();
-  refilter(wanted_hz);
+  filterAnew();
 }
 
 /** @param {number | null} wanted_hz */

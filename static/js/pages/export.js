@@ -65,6 +65,7 @@ const targetChoice = segmented({
   onChange: chooseTarget,
 });
 targetChoice.element.hidden = results.targets.length < 2;
+const beforeBox = h("div", { role: "status", hidden: true });
 const overlayBox = h("div", { class: "export-overlay" });
 const errorBox = h("div", { class: "export-error" });
 const tableBox = h("section", { class: "card export-table", "aria-label": "Peaks and residual" });
@@ -84,7 +85,7 @@ fill(
       h("span", { class: "spring" }),
       axisChoice.element,
     ),
-    h("div", { class: "stage-body export-stage" }, overlayBox, errorBox, tableBox),
+    h("div", { class: "stage-body export-stage" }, beforeBox, overlayBox, errorBox, tableBox),
   ),
   h("aside", { class: "side", "aria-label": "Validation and files" }, gpsBox, fileBox, archiveBox),
 );
@@ -93,6 +94,7 @@ const errorPlot = new Plot(errorBox, { title: "Video less GPS", unit: "m", link:
 const reportJob = jobCard();
 
 page.events.on("results", () => void reload().catch(toastError));
+page.store.on("change", ({ origin }) => origin === "undo" && void reload().catch(toastError));
 page.events.on("job", onJob);
 page.keys([
   { keys: "A", group: "Validate", label: "East or north", run: () => chooseAxis(axis === "x" ? "y" : "x") },
@@ -117,27 +119,41 @@ async function reload() {
   showAll();
 }
 
+/** Whether only the result from before a change can be shown: nothing has been measured as the project stands now. */
+function isFromBefore() {
+  return results.stale && !results.measured;
+}
+
 async function loadCurves() {
   const { inputs, drift } = page.store.project;
   const done = busyOver(overlayBox, "Solving for the curves…");
   const corner_hz = drift.filter === "high-pass" ? drift.corner_hz : null;
-  try {
-    if (inputs.gps === null) validation = null;
-    else validation = await get(projectPath(page.id, "validation", { target, corner_hz }));
-    if (validation === null) history = await fetchHistory(page.id, target);
-  } catch (error) {
-    problem = sentence(error);
-    history = await fetchHistory(page.id, target);
-  } finally {
-    done();
-  }
+  const method = isFromBefore() ? results.summary?.method : undefined;
+  const noted = (/** @type {unknown} */ error) => ((problem ||= sentence(error)), null);
+  validation = history = null;
+  if (inputs.gps !== null && !isFromBefore())
+    validation = await get(projectPath(page.id, "validation", { target, corner_hz })).catch(noted);
+  if (validation === null) history = await fetchHistory(page.id, target, method).catch(noted);
+  done();
 }
 
 function showAll() {
+  showBefore();
   draw();
   showGps();
   showTable();
   showFiles();
+}
+
+/** What is shown is the project's, or it says so. */
+function showBefore() {
+  const nothing = validation === null && history === null && problem !== "";
+  const before = "The project has changed since it was tracked. This is the last result, from before the change.";
+  const words = note("warn", nothing ? problem : before);
+  words.classList.add("banner");
+  words.append(h("a", { class: "button small", href: stepUrl(page.id, "track") }, "Go to Track"));
+  beforeBox.hidden = !nothing && !isFromBefore();
+  fill(beforeBox, beforeBox.hidden ? null : words);
 }
 
 function draw() {
@@ -157,6 +173,7 @@ function draw() {
     );
     const { error } = validation;
     if (error) errorPlot.setTraces([{ label: "Error", colour: "--series-4" }], [error.time_s, error[key]]);
+    overlay.setStatuses([]);
     const domain = /** @type {[number, number]} */ ([time[0], time.at(-1) ?? 1]);
     overlay.setDomain(domain);
     errorPlot.setDomain(domain);
@@ -168,8 +185,9 @@ function draw() {
       ],
       [history.time_s, history[`p1_${key}`], history[`p2_${key}`]],
     );
+    overlay.setDomain(null);
     overlay.setStatuses(history.status);
-  }
+  } else overlay.setTraces([], [[]]);
 }
 
 /**
@@ -243,10 +261,24 @@ function showTable() {
       "header",
       {},
       h("h2", {}, rows.length ? "Peaks and residual, video and GPS" : "Peaks and residual"),
+      results.stale && validation === null ? h("span", { class: "badge warn" }, "from before the change") : null,
       h("span", { class: "badge" }, target),
     ),
+    unseenNote(),
     rows.length ? comparisonTable(rows) : summaryTable(),
   );
+}
+
+/** A peak in a frame that was not measured is in no table. */
+function unseenNote() {
+  const { event } = page.store.project.intervals_s;
+  const time_s = validation?.video.time_s ?? history?.time_s ?? [];
+  const moved = validation?.video.dx_m ?? history?.p1_dx_m ?? [];
+  const isShaken = (/** @type {number} */ time) => event === null || (time >= event[0] && time <= event[1]);
+  const unseen = time_s.filter((time, i) => moved[i] === null && isShaken(time)).length;
+  if (unseen === 0) return null;
+  const where = event === null ? "" : " of the event";
+  return note("warn", `${plural(unseen, "frame")}${where} excluded or lost: the true peak may lie among them.`);
 }
 
 /**

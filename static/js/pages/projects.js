@@ -62,6 +62,7 @@ async function load() {
 
 /** @param {Listed} project */
 function card(project) {
+  const hasVideo = project.steps.inputs.status !== "todo";
   const next = STEPS.find(({ step }) => project.steps[step].status !== "done");
   const steps = STEPS.map(({ step, name }, i) => {
     const { status, message } = project.steps[step];
@@ -80,10 +81,10 @@ function card(project) {
     "article",
     { class: "card project-card", "data-project": project.id },
     h("img", {
-      class: "still",
+      class: `still ${hasVideo ? "" : "missing"}`,
       alt: "",
       loading: "lazy",
-      src: `/api/${projectPath(project.id, "frames/0.jpg", { w: 360 })}`,
+      src: hasVideo && `/api/${projectPath(project.id, "frames/0.jpg", { w: 360 })}`,
       onerror: (/** @type {Event} */ event) => /** @type {Element} */ (event.target).classList.add("missing"),
     }),
     h(

@@ -11,7 +11,7 @@ import { Loupe } from "../components/loupe.js";
 import { Pane } from "../components/pane.js";
 import { paneChrome } from "../components/pane-chrome.js";
 import { PaneImage } from "../components/pane-image.js";
-import { nudgeKeys, paneKeys } from "../components/pane-keys.js";
+import { activePane, nudgeKeys, paneKeys } from "../components/pane-keys.js";
 import { openPage } from "../components/page.js";
 import { PolygonEditor } from "../components/polygon-editor.js";
 import { segmented } from "../components/segmented.js";
@@ -41,6 +41,7 @@ if (wanted !== null) targets.select(wanted);
 let grid = { west_m: 0, north_m: 0, pixel_size_m: 0.01, width: 0, height: 0 };
 /** @type {Preview | null} */
 let preview = null;
+let camera_m = Infinity; // height above the ground, until the fit is known
 
 const toPixels = (/** @type {Point} */ plan) => orthoFromWorld(grid, plan);
 const toPlan = (/** @type {Point} */ pixels) => worldFromOrtho(grid, pixels);
@@ -125,7 +126,7 @@ planPane.addPainter(edgePainter(() => preview, "plan", toPixels));
 
 // --- panels
 
-const showTargets = targetsPanel(find("#targets"), targets);
+const showTargets = targetsPanel(find("#targets"), targets, () => camera_m);
 const showBands = bandsPanel(find("#bands"), bands, (line, band) => saveBand(line, band, `Number of ${line}`, true));
 const showMoving = movingPanel(find("#moving"), {
   onSelect: (index) => moving.select(index),
@@ -234,7 +235,7 @@ const focusedEditor = () => {
   const pane = focusedPane();
   return pane === null ? null : editorOf(pane);
 };
-const bandKeys = () => planPane.hasFocus && bands.selected !== null;
+const bandKeys = () => activePane(panes) === planPane && bands.selected !== null;
 page.keys([
   {
     keys: "Click",
@@ -302,7 +303,7 @@ page.keys([
     run: () => loupes.forEach((loupe) => loupe.setEnabled(!loupe.enabled)),
   },
   { keys: "V", group: "Looking", label: "Both pictures, the frame, the orthorectified frame", run: nextLayout },
-  ...paneKeys(panes, { canPan: () => focusedEditor()?.selected == null }),
+  ...paneKeys(panes, { canPan: () => editorOf(activePane(panes)).selected === null, chosen: activePane }),
 ]);
 
 // --- pictures
@@ -351,17 +352,25 @@ async function loadPlan() {
   }
 }
 
+async function findCamera() {
+  const { correspondences } = store.project;
+  const { camera } = await post(projectPath(page.id, "fit"), { correspondences });
+  camera_m = camera?.height_m ?? Infinity;
+}
+
 store.on("change", ({ project, previous }) => {
   const rectifiedAnew =
     JSON.stringify([project.correspondences, project.orthoimage, project.inputs]) !==
     JSON.stringify([previous.correspondences, previous.orthoimage, previous.inputs]);
   if (project.reference_frame !== previous.reference_frame) void loadFrame();
+  if (rectifiedAnew) void findCamera().catch(toastError);
   if (rectifiedAnew || project.reference_frame !== previous.reference_frame) void loadPlan().catch(toastError);
 });
 page.events.on("orthoimage", () => void loadPlan());
 
 showTargets();
 draw();
+void findCamera().catch(toastError);
 await Promise.all([loadFrame(), loadPlan()]);
 const drawn = [...Object.values(bands.bands).flatMap(cornersOf), ...(targets.selected?.region_m ?? [])].map(toPixels);
 if (drawn.length > 0 && planPane.image !== null) planPane.lookAtAll(drawn);

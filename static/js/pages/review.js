@@ -31,7 +31,7 @@ import { toast, toastError } from "../components/toast.js";
 const STAGES = [
   { value: "frame", name: "Frame" },
   { value: "both", name: "Both" },
-  { value: "scene", name: "3-D" },
+  { value: "scene", name: "3D" },
 ];
 /** @type {Record<string, string>} */
 const STATUS_TONES = { ok: "good", weak: "warn", lost: "bad", excluded: "" };
@@ -210,7 +210,7 @@ function keys() {
       run: () => setLayer(entry.layer, !layers.has(entry.layer)),
     })),
     { keys: "M", group: "Overlay", label: "Compare methods", run: () => compare(!compared) },
-    { keys: "V", group: "Looking", label: "Frame, both, 3-D", run: nextStage },
+    { keys: "V", group: "Looking", label: "Frame, both, 3D", run: nextStage },
     { keys: "Z", group: "Looking", label: "Loupe", run: () => view.toggleLoupe() },
     ...paneKeys([view.pane]),
     { keys: "Drag", group: "Plots", label: "Move through the video" },

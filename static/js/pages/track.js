@@ -137,8 +137,10 @@ async function loadResults() {
 /** The finished history takes the place of what was drawn while it grew. */
 async function loadHistory() {
   const name = currentTarget();
+  if (!results?.targets.includes(name)) return draw(); // drawn since: nothing measured of it yet
+  const method = results.stale && !results.measured ? results.summary?.method : undefined;
   try {
-    const history = await fetchHistory(page.id, name);
+    const history = await fetchHistory(page.id, name, method);
     rows.set(
       name,
       new Map(

@@ -22,7 +22,7 @@ const TONES = /** @type {Record<string, string>} */ ({ ok: "good", too_few: "", 
 
 /** @param {HTMLElement} element */
 export function fitPanel(element) {
-  const figures = h("div", { class: "figures" });
+  const figures = h("div", { class: "figures four" });
   const message = h("p", { class: "note", role: "status", hidden: true });
   const grid = h("div", { class: "coverage", role: "img" });
   const camera = h("p", { class: "small faint number" });

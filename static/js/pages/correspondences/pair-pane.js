@@ -5,6 +5,7 @@ import { Loupe } from "../../components/loupe.js";
 import { paneChrome } from "../../components/pane-chrome.js";
 import { add, times } from "../../lib/coordinates.js";
 import { Emitter } from "../../lib/emitter.js";
+import { fixed } from "../../lib/format.js";
 import { setView, viewNumbers } from "../../lib/view-state.js";
 import { otherSide } from "./slots.js";
 
@@ -22,7 +23,7 @@ import { otherSide } from "./slots.js";
  * @property {(shown: Point) => Point | Promise<Point>} stored
  */
 
-const ARROW_PX = 26; // CSS px for a residual of one px of the picture
+export const ARROW_PX = 26; // CSS px for a residual of one px of the video
 
 /** @type {Mapping} */
 export const identity = { shown: (points) => points, stored: (point) => point };
@@ -36,6 +37,8 @@ export class PairPane extends Emitter {
   ghosts = new Map();
   /** @type {Map<number, Point>} from mark to where the fit wants it, px shown */
   residuals = new Map();
+  /** CSS px for a residual of one px of the picture shown. */
+  arrowPx = ARROW_PX;
   #frameName;
   #aims = false;
   /** @type {Promise<void>} */
@@ -121,18 +124,10 @@ export class PairPane extends Emitter {
   draw() {
     const { pairs, halves, selected } = this.slots;
     /** @type {import("../../components/shapes.js").Shape[]} */
-    const shapes = [];
+    const shapes = this.#arrows();
     const mark = (/** @type {number} */ id, /** @type {string} */ look) => {
       const point = this.shown.get(id);
       if (point === undefined) return;
-      const offset = this.residuals.get(id);
-      if (offset !== undefined && !look.includes("off"))
-        shapes.push({
-          id: `residual-${id}`,
-          kind: "arrow",
-          class: "residual",
-          points: [point, add(point, times(offset, this.#arrowScale))],
-        });
       shapes.push({
         id: `pair-${id}`,
         kind: "mark",
@@ -150,21 +145,40 @@ export class PairPane extends Emitter {
         shapes.push({ id: `ghost-${half.id}`, kind: "mark", class: "ghost", label: `${half.id}?`, points: [ghost] });
     }
     if (this.#aims && this.pane.image !== null)
-      shapes.push({ id: "aim", kind: "mark", class: "aim", points: [this.pane.centre] });
+      shapes.push({ id: "aim", kind: "aim", points: [this.pane.centre] });
     this.pane.setShapes(shapes);
     const half = this.slots.waitingFor(this.side);
     this.chrome.setHint(half === null ? "" : `Click completes pair ${half.id}`);
+    const scale = fixed(this.#arrowScale, this.#arrowScale < 10 ? 1 : 0);
+    this.chrome.setLegend(this.residuals.size === 0 || this.pane.image === null ? "" : `→ residuals × ${scale}`);
+  }
+
+  /** Residuals, below all marks and their numbers. @returns {import("../../components/shapes.js").Shape[]} */
+  #arrows() {
+    return this.slots.pairs.flatMap(({ id, enabled }) => {
+      const point = this.shown.get(id);
+      const offset = this.residuals.get(id);
+      if (point === undefined || offset === undefined || !enabled) return [];
+      const points = [point, add(point, times(offset, this.#arrowScale))];
+      return [{ id: `residual-${id}`, kind: /** @type {const} */ ("arrow"), class: "residual", points }];
+    });
   }
 
   /** How much residuals are enlarged: as long on the screen at any zoom, but never shorter than they are. */
   get #arrowScale() {
-    return Math.max(1, ARROW_PX / this.pane.view.scale);
+    return Math.max(1, this.arrowPx / this.pane.view.scale);
   }
 
   /** Zoom to a pair. @param {number} id @param {number} scale */
   goTo(id, scale) {
     const place = this.placeOf(id);
     if (place !== null) this.pane.lookAt(place, Math.max(scale, this.pane.view.scale));
+  }
+
+  /** Take the keys, without aiming. */
+  focus() {
+    this.pane.element.focus({ preventScroll: true });
+    this.#setAim(false);
   }
 
   /** Move the selected mark a little. @param {Point} delta px shown */
@@ -198,10 +212,17 @@ export class PairPane extends Emitter {
     pane.on("drop", ({ id, point }) => this.#store(point, (stored) => this.slots.move(idOf(id), this.side, stored)));
     pane.on("cancel", () => this.refresh());
     pane.on("view", () => this.draw());
-    pane.element.addEventListener("keydown", () => this.#setAim(true));
+    pane.element.addEventListener("keydown", ({ key }) => this.#aimsBy(key) && this.#setAim(true));
     pane.element.addEventListener("focus", () => this.#setAim(pane.element.matches(":focus-visible")));
     pane.element.addEventListener("blur", () => this.#setAim(false));
-    pane.element.addEventListener("pointermove", () => this.#setAim(false));
+    for (const name of ["pointerdown", "pointermove"])
+      pane.element.addEventListener(name, () => this.#setAim(false));
+  }
+
+  /** Whether a key moves the view, and so the aim, or places there. @param {string} key */
+  #aimsBy(key) {
+    const pans = key.startsWith("Arrow") && this.slots.selected === null;
+    return pans || ["+", "=", "-", "0", "1", "Enter", " "].includes(key);
   }
 
   /** @param {Point} point px shown */

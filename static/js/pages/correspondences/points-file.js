@@ -49,3 +49,12 @@ export function pairsFromPoints(text, name) {
     };
   });
 }
+
+const SAME = 1e-3; // px or m; a file keeps six decimals
+
+/** Those of a file that are not among the pairs. @param {Omit<Correspondence, "id">[]} read @param {Correspondence[]} pairs */
+export const notAmong = (read, pairs) =>
+  read.filter((found) => !pairs.some((pair) => isNear(found.ground_m, pair.ground_m) && isNear(found.frame_px, pair.frame_px)));
+
+/** @param {number[]} a @param {number[]} b */
+const isNear = (a, b) => a.every((value, i) => Math.abs(value - b[i]) < SAME);

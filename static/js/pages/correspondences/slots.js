@@ -6,7 +6,8 @@ import { Emitter } from "../../lib/emitter.js";
 /** @typedef {import("../../lib/types.js").Point} Point */
 /** @typedef {import("../../lib/store.js").ProjectStore} ProjectStore */
 /** @typedef {"frame_px" | "ground_m"} Side */
-/** @typedef {{id: number, frame_px: Point | null, ground_m: Point | null}} Half */
+/** @typedef {import("../../lib/types.js").Project} Project */
+/** @typedef {{id: number, frame_px: Point | null, ground_m: Point | null, on?: number}} Half  on: stamp of the project it was clicked on */
 
 /** @param {Side} side @returns {Side} */
 export const otherSide = (side) => (side === "frame_px" ? "ground_m" : "frame_px");
@@ -17,6 +18,10 @@ export class Slots extends Emitter {
   halves = [];
   /** @type {number | null} id of a pair or half */
   selected = null;
+  /** @type {Half[]} taken back, newest last, until something new is done */
+  #taken = [];
+  /** @type {{halves: Half[], before: number, after: number} | null} halves that went with all pairs */
+  #cleared = null;
   #key;
 
   /** @param {ProjectStore} store */
@@ -25,7 +30,7 @@ export class Slots extends Emitter {
     this.store = store;
     this.#key = `rooftrack-halves:${store.id}`;
     this.halves = JSON.parse(localStorage.getItem(this.#key) ?? "[]");
-    store.on("change", () => this.#tidy());
+    store.on("change", (change) => this.#onProject(change));
     this.#tidy();
   }
 
@@ -33,9 +38,10 @@ export class Slots extends Emitter {
     return this.store.project.correspondences;
   }
 
-  /** The half that the next click on a side completes. @param {Side} side */
+  /** The half that the next click on a side completes: the selected one, else the oldest. @param {Side} side */
   waitingFor(side) {
-    return this.halves.find((half) => half[side] === null) ?? null;
+    const waiting = this.halves.filter((half) => half[side] === null);
+    return waiting.find((half) => half.id === this.selected) ?? waiting[0] ?? null;
   }
 
   /** A click on a side: fills the next free slot, or opens one. @param {Side} side @param {Point} point @returns {number} id of the pair */
@@ -43,8 +49,9 @@ export class Slots extends Emitter {
     const half = this.waitingFor(side);
     if (half === null) {
       const id = this.#nextId();
-      const fresh = /** @type {Half} */ ({ id, frame_px: null, ground_m: null });
+      const fresh = /** @type {Half} */ ({ id, frame_px: null, ground_m: null, on: stampOf(this.store.project) });
       fresh[side] = point;
+      this.#taken = [];
       this.#setHalves([...this.halves, fresh], id);
       return id;
     }
@@ -94,9 +101,39 @@ export class Slots extends Emitter {
     });
   }
 
+  /** All pairs, and the halves with them. @param {string} [label] @param {(draft: Project) => void} [also] */
+  removeAll(label = "Delete all pairs", also = () => undefined) {
+    const before = stampOf(this.store.project);
+    const { halves } = this;
+    this.#setHalves([], null);
+    void this.store.edit(label, (draft) => {
+      draft.correspondences = [];
+      also(draft);
+    });
+    this.#cleared = { halves, before, after: stampOf(this.store.project) };
+  }
+
   /** Give up the newest half. */
   dropNewestHalf() {
+    this.#taken.push(...this.halves.slice(-1));
     this.#setHalves(this.halves.slice(0, -1), null);
+  }
+
+  /** Whether the newest half is newer than every edit of the project: then it is what undo takes back. */
+  get isHalfNewest() {
+    return this.halves.length > 0 && this.halves.at(-1)?.on === stampOf(this.store.project);
+  }
+
+  /** Whether the last thing undone was a half. */
+  get isHalfNext() {
+    return this.#taken.length > 0 && this.#taken.at(-1)?.on === stampOf(this.store.project);
+  }
+
+  /** Bring back the half taken last. */
+  bringBack() {
+    const half = this.#taken.pop();
+    if (half !== undefined) this.#setHalves([...this.halves, half], half.id);
+    this.#tidy();
   }
 
   /** @param {number | null} id */
@@ -142,6 +179,25 @@ export class Slots extends Emitter {
     this.emit("change", null);
   }
 
+  /** @param {{project: Project, previous: Project, origin: string}} change */
+  #onProject({ project, previous, origin }) {
+    if (origin === "edit") this.#taken = [];
+    if (origin === "saved") this.#restamp(stampOf(previous), stampOf(project));
+    if (origin === "undo" && this.#cleared !== null) {
+      const now = stampOf(project);
+      if (now === this.#cleared.before) this.halves = [...this.#cleared.halves, ...this.halves];
+      if (now === this.#cleared.after) this.halves = [];
+    }
+    this.#tidy();
+  }
+
+  /** What is saved may be written otherwise than it was edited, and is the same. @param {number} before @param {number} after */
+  #restamp(before, after) {
+    const led = (/** @type {number | undefined} */ stamp) => (stamp === before ? after : stamp);
+    this.halves = this.halves.map((half) => ({ ...half, on: led(half.on) }));
+    if (this.#cleared !== null) this.#cleared.after = led(this.#cleared.after) ?? after;
+  }
+
   /** After edits from anywhere: no half under a pair's number, no selection of what is gone. */
   #tidy() {
     const taken = new Set(this.pairs.map((pair) => pair.id));
@@ -150,4 +206,11 @@ export class Slots extends Emitter {
       this.selected === null || taken.has(this.selected) || halves.some((half) => half.id === this.selected);
     this.#setHalves(halves, known ? this.selected : null);
   }
+}
+
+/** A short name for what a project says: two with the same say the same. @param {Project} project */
+function stampOf(project) {
+  let stamp = 0;
+  for (const character of JSON.stringify(project)) stamp = (Math.imul(stamp, 31) + character.charCodeAt(0)) | 0;
+  return stamp;
 }

@@ -194,11 +194,9 @@ export function calibrationReport(projectId) {
   return {
     element,
     async refresh() {
-      try {
-        show(element, projectId, /** @type {Report} */ (await get(projectPath(projectId, "lens/report"))));
-      } catch {
-        element.hidden = true; // no lens has been calibrated here: nothing to report
-      }
+      const report = /** @type {Report | null} */ (await get(projectPath(projectId, "lens/report")).catch(() => null));
+      if (report === null) element.hidden = true;
+      else show(element, projectId, report);
     },
   };
 }

@@ -57,7 +57,7 @@ function lens(facts) {
         .map((/** @type {number} */ value, /** @type {number} */ i) => `${names[i]} ${fixed(value, 4)}`)
         .join(", "),
     ],
-    ["Calibration RMS", pixels(facts.rms_px, 3)],
+    ["Calibration RMS", facts.rms_px == null ? "not in the file" : pixels(facts.rms_px, 3)],
   ];
 }
 

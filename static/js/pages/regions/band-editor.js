@@ -41,7 +41,7 @@ export class BandEditor extends Emitter {
     this.pane = pane;
     this.options = options;
     pane.on("click", ({ point }) => options.accepts() && this.click(options.toPlan(point)));
-    pane.on("select", ({ id }) => this.#at(id, (line, part) => this.select(line, part)));
+    pane.on("select", ({ id }) => this.#at(id, (line, part) => this.#take(line, part)));
     pane.on("drag", ({ id, point, delta }) => this.#at(id, (line, part) => this.#drag(line, part, point, delta)));
     pane.on("drop", ({ id, point, delta }) => this.#at(id, (line, part) => this.#drop(line, part, point, delta)));
     pane.on("cancel", () => this.#abandon());
@@ -62,6 +62,11 @@ export class BandEditor extends Emitter {
     return this.draft.length > 0;
   }
 
+  /** While a band is drawn, bands lie in no click's way. */
+  get #grabs() {
+    return !this.isDrawing && this.redrawing === null;
+  }
+
   /** @returns {Shape[]} */
   shapes() {
     const { toPixels } = this.options;
@@ -75,10 +80,10 @@ export class BandEditor extends Emitter {
       shapes.push({
         id: `band:${line}:band`,
         kind: "polygon",
-        class: `${look} ${isSelected ? "hot" : "thin"}`,
+        class: `${look} ${isSelected ? "hot" : "thin"} ${line === this.redrawing ? "old" : ""}`,
         points: cornersOf(band).map(toPixels),
         label: line,
-        grab: true,
+        grab: this.#grabs,
       });
       if (!isSelected) continue;
       for (const [part, place] of /** @type {[Part, Point][]} */ ([
@@ -163,6 +168,14 @@ export class BandEditor extends Emitter {
     else if (this.redrawing !== null) this.redrawing = null;
     else this.selected = null;
     this.emit("change", null);
+  }
+
+  /** A click on a band: where the next click is to draw another one, it does. @param {LineName} line @param {Part} part */
+  #take(line, part) {
+    const { accepts, toPlan } = this.options;
+    if (part === "band" && this.nextLine !== null && this.pane.cursor !== null && accepts())
+      this.click(toPlan(this.pane.cursor));
+    else this.select(line, part);
   }
 
   /** @param {LineName | null} line @param {Part} [part] */

@@ -42,6 +42,12 @@ const NUMBERS = [
   },
 ];
 
+const NOTED_ERROR = 0.02; // of P1–P2: more than lines found to a pixel and a height known to some centimetres explain
+const WRONG_ERROR = 0.1; // another pair of lines, or another height
+
+/** @param {number} error  share of the distance given */
+const toneOf = (error) => (error > WRONG_ERROR ? "bad" : error > NOTED_ERROR ? "warn" : "");
+
 /** @param {HTMLElement} element @param {BandEditor} editor @param {(line: LineName, band: Band) => void} save */
 export function bandsPanel(element, editor, save) {
   const rows = new Map(LINE_NAMES.map((line) => [line, new BandRow(line, editor, save)]));
@@ -57,8 +63,9 @@ export function bandsPanel(element, editor, save) {
   return function show(preview) {
     for (const line of LINE_NAMES) rows.get(line)?.show(editor.bands[line] ?? null, preview?.lines?.[line] ?? null);
     message.hidden = !preview?.message;
-    message.className = "note";
-    fill(message, icon("info"), h("span", {}, preview?.message ?? ""));
+    const tone = toneOf(Math.abs(preview?.p1_p2_error ?? 0));
+    message.className = `note ${tone}`;
+    fill(message, icon(tone === "" ? "info" : "warn"), h("span", {}, preview?.message ?? ""));
   };
 }
 

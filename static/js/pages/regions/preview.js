@@ -19,7 +19,7 @@ import { markColour } from "../../components/palette.js";
  * @property {string | null} message
  *
  * @typedef {{plan: Point, raw: Point, world: Point} | null} PointPreview
- * @typedef {{lines: Partial<Record<LineName, LinePreview>>, p1: PointPreview, p2: PointPreview, points_plan?: Point[], points_raw?: Point[], message: string | null}} Preview  points: patches of a region
+ * @typedef {{lines: Partial<Record<LineName, LinePreview>>, p1: PointPreview, p2: PointPreview, points_plan?: Point[], points_raw?: Point[], message: string | null, p1_p2_error?: number | null}} Preview  points: patches of a region
  * @typedef {"plan" | "raw"} Frame
  */
 

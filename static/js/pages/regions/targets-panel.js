@@ -12,8 +12,8 @@ import { toast } from "../../components/toast.js";
 /** @typedef {import("../../lib/targets.js").Targets} Targets */
 /** @typedef {import("../../lib/targets.js").OpenTarget} OpenTarget */
 
-/** @param {HTMLElement} element @param {Targets} targets */
-export function targetsPanel(element, targets) {
+/** @param {HTMLElement} element @param {Targets} targets @param {() => number} camera_m  height of the camera above the ground */
+export function targetsPanel(element, targets, camera_m) {
   const add = menuButton({
     label: "Add target",
     icon: "add",
@@ -23,7 +23,7 @@ export function targetsPanel(element, targets) {
     ],
   });
   const list = h("ul", { class: "target-list", role: "listbox", "aria-label": "Targets" });
-  const settings = targetSettings(targets);
+  const settings = targetSettings(targets, camera_m);
   fill(element, h("header", {}, h("h2", {}, "Targets"), add), list, settings.element);
 
   return function show() {
@@ -34,8 +34,12 @@ export function targetsPanel(element, targets) {
   };
 }
 
-/** Height, P1–P2 distance and reference of the chosen target. @param {Targets} targets */
-function targetSettings(targets) {
+/**
+ * Height, P1–P2 distance and reference of the chosen target.
+ * @param {Targets} targets
+ * @param {() => number} camera_m
+ */
+function targetSettings(targets, camera_m) {
   const change = (/** @type {string} */ what, /** @type {(target: OpenTarget) => void} */ edit) => {
     const { selected } = targets;
     if (selected !== null) targets.change(selected.name, `${what} of ${selected.name}`, edit);
@@ -46,6 +50,8 @@ function targetSettings(targets) {
     value: null,
     optional: true,
     step: 0.05,
+    max: () => camera_m() - 0.01,
+    tooGreat: () => `The camera is ${metres(camera_m(), 1)} above the ground by the pairs; a roof lies below it.`,
     onChange: (value) => change("Height", (target) => void (target.height_m = value)),
   });
   const apart = numberField({
