@@ -14,7 +14,7 @@ import { projectPath } from "./api.js";
  * @property {object} results
  * @property {any} track
  * @property {{xyz_m?: [number, number, number], height_m?: number, spread_m?: number, points?: number, message?: string}} pick
- * @property {any} scene
+ * @property {{owner: string | null, frame?: number | null}} scene which project the 3D view holds now
  */
 
 const NAMES = /** @type {const} */ ([

@@ -54,8 +54,6 @@ const chrome = paneChrome(pane, {
             .join(", ")} m`,
         ],
 });
-const sceneNote = h("div", { class: "pane-note", hidden: true, role: "status" });
-find("#scene").append(sceneNote);
 const tabs = segmented({
   label: "View",
   choices: /** @type {{value: Tab, name: string}[]} */ ([
@@ -76,18 +74,14 @@ function showTab(tab) {
   if (tab === "scene") openScene();
 }
 
+const isSceneOpen = () => find("#scene").querySelector("iframe") !== null;
+
 function openScene() {
-  if (find("#scene").querySelector("iframe") === null)
+  if (!isSceneOpen())
     find("#scene").prepend(
       h("iframe", { class: "scene-frame", title: "3D scene of the point cloud", src: "/viser/?hideViserLogo" }),
     );
   scene.send();
-}
-
-/** @param {string} message */
-function tellScene(message) {
-  sceneNote.hidden = message === "";
-  sceneNote.textContent = message;
 }
 
 // --- heights
@@ -119,7 +113,7 @@ function drawPick() {
 
 // --- panels
 
-const scene = scenePanel(find("#scene-settings"), page.id, tellScene);
+const scene = scenePanel(find("#scene-settings"), page.id, find("#scene"));
 const ground = h("div", { class: "settings" });
 const groundLevel = numberField({
   label: "Ground level in the cloud",
@@ -348,10 +342,16 @@ store.on("change", ({ project, previous, origin }) => {
   if (origin === "saved" || changed) void load();
 });
 page.events.on("job", showJob);
-page.events.on("hello", ({ job: running }) => showJob(running));
+page.events.on("hello", ({ job: running }) => {
+  showJob(running);
+  if (isSceneOpen()) scene.send(); // another window may have taken the scene meanwhile
+});
+page.events.on("scene", ({ owner }) => {
+  if (scene.cover.isElsewhere(owner)) scene.cover.show({ ready: false, message: "", owner });
+});
 page.events.on("inputs", () => {
   void load();
-  scene.send();
+  if (isSceneOpen()) scene.send();
 });
 page.events.on("orthoimage", () => {
   madeTimes += 1;

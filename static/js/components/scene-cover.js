@@ -1,0 +1,40 @@
+// What lies over the 3D view while it holds nothing of this project. The server has one scene for all windows: where
+// another project has it, this window must not show that project's points as its own.
+
+import { fill, h } from "../lib/dom.js";
+
+/** @typedef {{ready: boolean, message: string, owner: string | null}} SceneAnswer */
+
+export class SceneCover {
+  /** @param {HTMLElement} host what holds the 3D view @param {string} projectId @param {() => void} onTake the scene is wanted here */
+  constructor(host, projectId, onTake) {
+    this.host = host;
+    this.projectId = projectId;
+    this.onTake = onTake;
+    this.note = h("div", { class: "pane-note", hidden: true, role: "status" });
+    host.append(this.note);
+  }
+
+  /** Whether another project has the scene. @param {string | null | undefined} owner */
+  isElsewhere(owner) {
+    return owner !== null && owner !== undefined && owner !== this.projectId;
+  }
+
+  /** @param {SceneAnswer} answer */
+  show({ ready, message, owner }) {
+    if (this.isElsewhere(owner)) this.tell(`The 3D view shows “${owner}” in another window.`, takeButton(this.onTake));
+    else if (ready) this.tell();
+    else this.tell(message);
+  }
+
+  /** Cover the view with words; without any, uncover it. @param {...(Node | string)} content */
+  tell(...content) {
+    this.note.hidden = content.length === 0;
+    this.host.classList.toggle("covered", content.length > 0);
+    fill(this.note, ...content);
+  }
+}
+
+/** @param {() => void} onTake */
+const takeButton = (onTake) =>
+  h("button", { class: "button small", type: "button", onclick: onTake }, "Show this project here");
