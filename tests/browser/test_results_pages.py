@@ -61,7 +61,9 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
         page.goto(f"{address}/p/sample/track")
         page.get_by_role("button", name="Start").click()
         page.wait_for_function("() => parseInt(document.querySelector('.figures .value')?.textContent) > 5")
+        expect(page.locator("[data-step=track]")).to_have_attribute("data-status", "running")
         page.get_by_role("button", name="Cancel").click()
+        expect(page.locator("[data-step=track]")).to_have_attribute("data-status", "warn")
         expect(page.get_by_role("button", name="Resume")).to_be_visible()
     with serving(tmp_path, port) as address, watched(browser, address) as page:
         kept = ask(f"{address}/p/sample", "track")["frames_done"]
@@ -81,6 +83,24 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
     resumed, straight = (read_history_csv(folder / "results" / "roof.csv") for folder in (tmp_path / "sample", scene))
     assert resumed.status.tolist() == straight.status.tolist()
     assert np.nanmax(np.abs(resumed.p1_m - straight.p1_m)) < SAME_M  # a lost frame has no value in either
+
+
+def test_a_server_that_is_gone_is_noticed_and_found_again(browser, scene, tmp_path):
+    shutil.copytree(scene, tmp_path / "sample", ignore=shutil.ignore_patterns("results"))
+    port = free_port()
+    with watched(browser, f"http://127.0.0.1:{port}") as page:
+        bar = page.get_by_text("The server does not answer")
+        with serving(tmp_path, port) as address:
+            page.goto(f"{address}/p/sample/track")
+            page.get_by_role("button", name="Start").click()
+            page.wait_for_function("() => parseInt(document.querySelector('.figures .value')?.textContent) > 5")
+            expect(bar).to_be_hidden()
+        expect(bar).to_be_visible(timeout=20_000)
+        expect(page.locator("progress.frozen")).to_be_visible()
+        expect(page.get_by_role("button", name="Cancel")).to_be_disabled()
+        with serving(tmp_path, port):
+            expect(bar).to_be_hidden(timeout=20_000)
+            expect(page.get_by_role("link", name="Review the result")).to_be_visible(timeout=240_000)
 
 
 def at_rest(page: Page, frame: int) -> None:

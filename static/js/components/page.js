@@ -19,7 +19,7 @@ import { ServerEventStream } from "../lib/events.js";
 import { bindKeys } from "../lib/keys.js";
 import { fill, find, h } from "../lib/dom.js";
 import { sentence } from "../lib/api.js";
-import { projectHeader, STEPS } from "./header.js";
+import { projectHeader, STEPS, tellConnection } from "./header.js";
 import { toast, toastError } from "./toast.js";
 
 /** @typedef {import("../lib/types.js").StepName} StepName */
@@ -31,7 +31,8 @@ export async function openPage(step) {
   try {
     const store = await ProjectStore.open(id);
     const events = new ServerEventStream(id);
-    projectHeader(store, step);
+    projectHeader(store, step, events);
+    tellConnection(events);
     tellTroubles(store);
     events.on("hello", ({ revision }) => store.heardOf(revision));
     events.on("project", ({ revision }) => store.heardOf(revision));

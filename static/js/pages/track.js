@@ -104,6 +104,8 @@ page.keys([
 ]);
 store.on("change", show);
 page.events.on("hello", () => void catchUp());
+page.events.on("offline", show);
+page.events.on("online", show);
 page.events.on("job", onJob);
 page.events.on("track", addRows);
 page.events.on("results", () => void loadResults());
@@ -220,7 +222,7 @@ function show() {
   targetChoice.element.hidden = targetNames().length < 2;
   targetChoice.offer(targetNames().map((name) => ({ value: name, name })));
   targetChoice.set(currentTarget());
-  live.hidden = !isRunning(track.job);
+  live.hidden = !isRunning(track.job) || !page.events.online;
   showControls();
   showMethods();
   showFacts();
@@ -295,8 +297,16 @@ function buttons(done) {
 /** @param {Job} job */
 function showRunning(job) {
   const share = job.total > 0 ? job.done / job.total : null;
-  const bar = h("progress", { max: 1, "aria-label": "Progress", value: share });
-  const title = job.state === "queued" ? "Waiting for its turn" : (STAGES[job.stage] ?? (job.stage || "Starting"));
+  const { online } = page.events; // what is heard no more stands still, and is not told as going on
+  const stage = job.state === "queued" ? "Waiting for its turn" : (STAGES[job.stage] ?? (job.stage || "Starting"));
+  const title = online ? stage : "Connection lost";
+  const bar = h("progress", { max: 1, "aria-label": "Progress", value: share, class: online ? null : "frozen" });
+  const stop = h(
+    "button",
+    { type: "button", class: "button", disabled: !online, onclick: () => void cancel() },
+    icon("close"),
+    "Cancel",
+  );
   fill(
     controls,
     h(
@@ -307,25 +317,28 @@ function showRunning(job) {
     ),
     bar,
     job.stage === MEASURING ? measuringFigures(job) : null,
-    h("p", { class: "small faint" }, "You may close this tab: the measurement goes on, and every frame is kept."),
     h(
-      "div",
-      { class: "toolbar" },
-      h("button", { type: "button", class: "button", onclick: () => void cancel() }, icon("close"), "Cancel"),
+      "p",
+      { class: "small faint" },
+      online
+        ? "You may close this tab: the measurement goes on, and every frame is kept."
+        : "Every frame measured so far is kept; once the server is back, the measurement goes on from there.",
     ),
+    h("div", { class: "toolbar" }, stop),
   );
 }
 
 /** @param {Job} job */
 function measuringFigures(job) {
+  const { online } = page.events;
   const figure = (/** @type {string} */ value, /** @type {string} */ name) =>
     h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
   return h(
     "div",
     { class: "figures" },
     figure(`${count(job.done)} / ${count(job.total)}`, "frames"),
-    figure(job.rate_per_s ? fixed(job.rate_per_s, 1) : "–", "frames/s"),
-    figure(duration(job.seconds_left), "left"),
+    figure(online && job.rate_per_s ? fixed(job.rate_per_s, 1) : "–", "frames/s"),
+    figure(online ? duration(job.seconds_left) : "–", "left"),
   );
 }
 
