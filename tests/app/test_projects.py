@@ -49,6 +49,32 @@ def test_a_project_is_listed_with_the_state_of_its_eight_steps(client: TestClien
     }
 
 
+def test_the_inputs_step_is_done_only_when_every_input_can_be_read(client: TestClient, workspace: Path) -> None:
+    def inputs() -> tuple[str, str]:
+        step = get(client)["steps"]["inputs"]
+        return step["status"], step["message"]
+
+    assert inputs()[0] == "done"
+    for name, content, said in (
+        ("gps.csv", "time_s,east_m\n0,0\n", "gps.csv: has no column"),
+        ("lens.yaml", "%YAML:1.0\nimage_width: 4\n", "lens.yaml: "),
+        ("video.mp4", "no video", "video.mp4: "),
+    ):
+        (workspace / "small" / name).write_text(content)
+        status, message = inputs()
+        assert (status, message[: len(said)]) == ("error", said)
+
+
+def test_a_step_that_was_not_done_is_not_called_done(client: TestClient) -> None:
+    made = client.post("/api/projects", json={"name": "empty"}).json()["id"]
+    steps = client.get(f"/api/projects/{made}").json()["steps"]
+    assert {step["status"] for step in steps.values()} == {"todo"}
+    state = get(client)
+    typed = state["project"] | {"inputs": state["project"]["inputs"] | {"cloud": None}}
+    client.put(SMALL, json={"project": typed, "revision": state["revision"]})
+    assert get(client)["steps"]["orthoimage"]["status"] == "unneeded"
+
+
 def test_an_edit_is_on_the_disk_and_has_a_new_revision(client: TestClient, workspace: Path) -> None:
     before = get(client)
     after = rename(client, "other", before["revision"]).json()

@@ -62,7 +62,7 @@ async function load() {
 
 /** @param {Listed} project */
 function card(project) {
-  const next = STEPS.find(({ step }) => project.steps[step].status !== "done");
+  const next = STEPS.find(({ step }) => !["done", "unneeded"].includes(project.steps[step].status));
   const steps = STEPS.map(({ step, name }, i) => {
     const { status, message } = project.steps[step];
     return h(
