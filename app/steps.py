@@ -30,6 +30,8 @@ STEPS = ("inputs", "orthoimage", "correspondences", "regions", "track", "review"
 _BAD_CLICK_RATIO, _BAD_CLICK_PX = 3.0, 1.5
 _GOOD_COVERAGE = 0.5
 
+_NO_VIDEO = "inputs.video: none is given yet; choose the video in the inputs."
+
 Step = dict[str, str]
 
 _PROBLEMS_KEPT = 32
@@ -238,6 +240,8 @@ def _problems(folder: ProjectFolder, project: Project, look: bool) -> list[str] 
     if look and key not in _known_problems:
         place = f"{folder.folder}{os.sep}"
         found = [problem.replace(place, "") for problem in check_project(folder.folder, with_cloud=False)]
+        if folder.named_input("video", project) is None:
+            found = [_NO_VIDEO if problem.startswith(f"{project.inputs.video}:") else problem for problem in found]
         while len(_known_problems) >= _PROBLEMS_KEPT:
             _known_problems.pop(next(iter(_known_problems)), None)
         _known_problems[key] = found

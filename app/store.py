@@ -140,7 +140,7 @@ class ProjectFolder:
         Raises:
             Refused: outside the allowed folders.
         """
-        stored = stored_inputs((project or self.load().project).inputs)[kind]
+        stored = self.named_input(kind, project or self.load().project)
         if stored is None:
             return None
         file = file_at(self.folder, stored) if kind == "video" else self.folder / stored
@@ -149,6 +149,15 @@ class ProjectFolder:
         if file.is_near:
             raise Refused(f"{file}: is a file of this computer; name it by its path.", path=f"inputs.{kind}")
         return file
+
+    def named_input(self, kind: str, project: Project) -> str | None:
+        """Return what a project names as an input, where a person named it; None where none is given.
+
+        A project needs the name of a video from the beginning, so one made without carries a name nobody chose.
+        """
+        stored = stored_inputs(project.inputs)[kind]
+        to_come = kind == "video" and stored == VIDEO_TO_COME and not (self.folder / stored).exists()
+        return None if to_come else stored
 
     def input_path(self, kind: str, project: Project | None = None) -> Path | None:
         """Return where an input lies on this computer, or None where none is given there.

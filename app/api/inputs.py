@@ -19,7 +19,7 @@ from app.errors import ApiError, Invalid, Missing
 from app.frames import fingerprint
 from app.jobs import Finish
 from app.places import SUFFIXES_OF_CLOUD_TABLES, kind_of
-from app.store import CHECKERBOARD_FOLDER, INPUT_KINDS, ProjectFolder, problem_of, read_json, stored_inputs
+from app.store import CHECKERBOARD_FOLDER, INPUT_KINDS, ProjectFolder, problem_of, read_json
 from app.uploads import receive_file
 from app.videos import is_read_through, video_info
 from core.errors import InputError
@@ -107,7 +107,7 @@ def inputs(folder: Folder, here: Here) -> dict[str, Any]:
 
 
 def _understood(here: Context, folder: ProjectFolder, project: Project, kind: str) -> dict[str, Any] | None:
-    named = stored_inputs(project.inputs)[kind]
+    named = folder.named_input(kind, project)
     if named is None:
         return None
     readers: dict[str, Callable[..., dict[str, Any]]] = {"video": _video, "cloud": _cloud, "lens": _lens, "gps": _gps}

@@ -65,6 +65,17 @@ def test_the_inputs_step_is_done_only_when_every_input_can_be_read(client: TestC
         assert (status, message[: len(said)]) == ("error", said)
 
 
+def test_a_project_made_without_a_video_claims_no_file(client: TestClient, workspace: Path) -> None:
+    made = client.post("/api/projects", json={"name": "empty"}).json()["id"]
+    pages = f"/api/projects/{made}"
+    assert client.get(f"{pages}/inputs").json()["video"] is None
+    told = [*client.get(pages).json()["problems"], client.get(f"{pages}/frames/0.jpg").json()["error"]["message"]]
+    assert [words for words in told if "video.mp4" in words] == []
+    assert "inputs.video: none is given yet; choose the video in the inputs." in told
+    (workspace / made / "video.mp4").write_bytes((workspace / "small" / "video.mp4").read_bytes())
+    assert client.get(f"{pages}/inputs").json()["video"]["file"] == "video.mp4"
+
+
 def test_a_step_that_was_not_done_is_not_called_done(client: TestClient) -> None:
     made = client.post("/api/projects", json={"name": "empty"}).json()["id"]
     steps = client.get(f"/api/projects/{made}").json()["steps"]
