@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 from app.errors import ApiError, Conflict, Invalid, Missing, Refused
 from app.history import HISTORY_FILE, Entry, Head, History
+from app.intake import require_usable
 from app.places import Places
 from core.errors import InputError
 from core.project import (
@@ -240,6 +241,9 @@ class ProjectFolder:
         before = stored_inputs(self._read().inputs)
         changed = {kind: file for kind, file in stored_inputs(project.inputs).items() if file != before[kind]}
         relative = {kind: self._relative(self.folder / file) for kind, file in changed.items() if file is not None}
+        for kind, file in relative.items():
+            if (path := self.folder / file).is_file():
+                require_usable(kind, path, path.name)
         return project.model_copy(update={"inputs": with_inputs(project.inputs, relative)})
 
     def _relative(self, file: Path) -> str:
@@ -313,9 +317,11 @@ class Workspace:
         """Make a project folder; `files` are absolute paths of its inputs.
 
         Raises:
-            ApiError: a file is outside the allowed folders or missing; nothing is left behind.
+            ApiError: a file is outside the allowed folders, missing or not what it should be; nothing is left behind.
         """
         given = {kind: self.places.file(file) for kind, file in files.items() if file}
+        for kind, file in given.items():
+            require_usable(kind, file, file.name)
         with self._new_folder(name) as folder:
             relative = {kind: Path(os.path.relpath(file, folder)).as_posix() for kind, file in given.items()}
             inputs = with_inputs(Inputs(video=VIDEO_TO_COME), relative)

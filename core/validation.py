@@ -143,8 +143,7 @@ def read_gps(path: Path, settings: GpsInput) -> GpsRecord:
         InputError: names the file, and the missing column or the line at fault.
     """
     lines = _content_lines(path)
-    separator = max(",;\t", key=lines[0][1].count)
-    header = [name.strip() for name in next(csv.reader([lines[0][1]], delimiter=separator))]
+    separator, header = _header_of(lines[0][1])
     columns = {key: getattr(settings, key) for key in ("time", "x", "y")}
     for key, name in columns.items():
         if name not in header:
@@ -166,6 +165,21 @@ def read_gps(path: Path, settings: GpsInput) -> GpsRecord:
             f"({table[backwards[0], 0]:g}); sort the record and remove what is double."
         )
     return GpsRecord(path.name, read_only(table[:, 0]), read_only(table[:, 1:]))
+
+
+def gps_columns(path: Path) -> list[str]:
+    """Return the names of a GPS record's columns, to choose time and place from.
+
+    Raises:
+        InputError: the file cannot be read as text, or is empty.
+    """
+    return _header_of(_content_lines(path)[0][1])[1]
+
+
+def _header_of(line: str) -> tuple[str, list[str]]:
+    """Return what separates the columns, and their names."""
+    separator = max(",;\t", key=line.count)
+    return separator, [name.strip() for name in next(csv.reader([line], delimiter=separator))]
 
 
 def _content_lines(path: Path) -> list[tuple[int, str]]:

@@ -17,6 +17,7 @@ from app.calibrations import REPORT_FILE, board_of
 from app.context import Context, Folder, Here, tell_saved
 from app.errors import ApiError, Invalid, Missing
 from app.frames import fingerprint
+from app.intake import require_usable
 from app.jobs import Finish
 from app.places import SUFFIXES_OF_CLOUD_TABLES, kind_of
 from app.store import CHECKERBOARD_FOLDER, INPUT_KINDS, ProjectFolder, problem_of, read_json
@@ -75,7 +76,10 @@ def _wanted(entry: dict[str, Any], kind: str | None) -> bool:
 
 @router.put("/projects/{project_id}/upload/{kind}")
 async def upload(kind: UploadKind, filename: str, request: Request, folder: Folder, here: Here) -> dict[str, Any]:
-    """Take in a file as the raw body; a checkerboard picture is kept beside the inputs, all others become the input."""
+    """Take in a file as the raw body; a checkerboard picture is kept beside the inputs, all others become the input.
+
+    What cannot be used as that input is refused, and the file given before stays.
+    """
     name = folder.free_name(filename)
     if kind == "checkerboard" and kind_of(Path(name)) != "image":
         raise Invalid(f"{name}: is no picture; send JPEG, PNG or TIFF files of the checkerboard.", path="filename")
@@ -90,6 +94,7 @@ def _take_in(here: Context, folder: ProjectFolder, kind: UploadKind, part: Path,
             (folder.folder / CHECKERBOARD_FOLDER).mkdir(exist_ok=True)
             os.replace(part, folder.folder / CHECKERBOARD_FOLDER / name)
             return {"file": f"{CHECKERBOARD_FOLDER}/{name}", "revision": folder.load().head.revision}
+        require_usable(kind, part, name)
         os.replace(part, folder.folder / name)
     finally:
         part.unlink(missing_ok=True)

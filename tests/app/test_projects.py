@@ -207,7 +207,8 @@ def test_a_copy_is_a_project_of_its_own(client: TestClient, workspace: Path) -> 
     rename(client, "changed", get(client)["revision"])
     assert client.get(f"/api/projects/{copy}").json()["project"]["name"] == "copy"
     assert (workspace / copy / "video.mp4").read_bytes() == (workspace / "small" / "video.mp4").read_bytes()
-    client.put(f"{SMALL}/upload/lens?filename=lens.yaml", content=b"other")
+    other = (workspace / "small" / "lens.yaml").read_bytes() + b"\n"
+    assert client.put(f"{SMALL}/upload/lens?filename=lens.yaml", content=other).status_code == 200
     assert (workspace / copy / "lens.yaml").read_bytes() != b"other"
 
 

@@ -335,7 +335,9 @@ def test_inputs_are_sent_taken_back_and_calibrated(browser, project, tmp_path):
         wrong = tmp_path / "wrong.yaml"
         wrong.write_text("not a lens")
         chooser.value.set_files(wrong)
-        expect(lens.locator(".note.bad")).to_contain_text("wrong.yaml")
+        expect(page.get_by_role("alert")).to_contain_text("wrong.yaml")
+        expect(lens.locator(".badge")).to_have_text("understood")  # the lens before stays
+        assert read_project(folder).inputs.lens == "lens.yaml"
 
         lens.get_by_role("button", name="Calibrate…").click()
         page.get_by_role("button", name="Pictures on this computer…").click()

@@ -31,14 +31,14 @@ const KINDS = /** @type {const} */ ([
     kind: "video",
     title: "Video",
     glyph: "video",
-    accept: "video/*",
+    accept: "video/*,.mp4,.mov,.m4v,.mkv,.avi,.mts,.m2ts,.ts,.webm",
     why: "A drone video of the structure from above, ground around it in view.",
   },
   {
     kind: "cloud",
     title: "Point cloud",
     glyph: "cube",
-    accept: ".las,.laz,.ply,.pcd,.xyz,.pts,.csv,.e57",
+    accept: ".las,.laz,.ply,.pcd,.xyz,.pts,.txt,.csv,.e57",
     why: "A LiDAR cloud of the site: it ties the picture to metres and gives the roof's height.",
   },
   {
@@ -52,7 +52,7 @@ const KINDS = /** @type {const} */ ([
     kind: "gps",
     title: "GPS",
     glyph: "clock",
-    accept: ".csv",
+    accept: ".csv,.txt",
     why: "Optional: a GPS record on the roof, to compare the result with.",
   },
 ]);

@@ -4,7 +4,7 @@ import { fill, h } from "../../lib/dom.js";
 import { pickFiles } from "../../lib/download.js";
 import { icon } from "../../lib/icons.js";
 import { duration, fixed, size } from "../../lib/format.js";
-import { projectPath, upload } from "../../lib/api.js";
+import { get, projectPath, upload } from "../../lib/api.js";
 import { chooseFiles } from "../../components/file-browser.js";
 import { toast, toastError } from "../../components/toast.js";
 import { factList } from "./facts.js";
@@ -59,8 +59,8 @@ export function inputCard({ projectId, kind, title, why, accept, glyph, onPath, 
   const sendFile = async (/** @type {File} */ file) => {
     try {
       await sendWithProgress(transfer, projectPath(projectId, `upload/${kind}`, { filename: file.name }), file);
-      toast(`${file.name} is here.`, { tone: "good" });
       onChange();
+      await tellUnderstood(projectId, kind, file.name);
     } catch (error) {
       toastError(error);
     }
@@ -98,6 +98,14 @@ export function inputCard({ projectId, kind, title, why, accept, glyph, onPath, 
         );
     },
   };
+}
+
+/** Say that a file is understood, once it is; what is wrong with one stands on its card. @param {string} projectId @param {InputKind} kind @param {string} name */
+async function tellUnderstood(projectId, kind, name) {
+  const facts = (await get(projectPath(projectId, "inputs")))[kind];
+  if (facts === null || facts.error) return;
+  if (facts.reading) toast(`${name} is here and being read.`);
+  else toast(`${name} is understood.`, { tone: "good" });
 }
 
 /** Stream a file, showing how far it is, with a way to stop. @param {HTMLElement} place @param {string} path @param {File} file */
