@@ -1,4 +1,4 @@
-"""What a file has to be before it becomes an input: looked into quickly, so that nothing replaces what works by less."""
+"""What a file has to be before it becomes an input: looked into quickly, so that nothing replaces what works."""
 
 from __future__ import annotations
 
