@@ -145,6 +145,8 @@ def validation(
         "correlation": plain(compared.correlation),
         "rms_m": {"x": plain(compared.rms_m[0]), "y": plain(compared.rms_m[1])},
         "table": plain(compared.table()),
+        "is_coarse": compared.is_coarse,
+        "spacing": compared.spacing,
         "message": message,
     }
 
