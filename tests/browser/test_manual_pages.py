@@ -317,6 +317,58 @@ def test_a_pair_is_placed_by_the_keyboard_alone(browser, project):
     assert read_project(folder).correspondences[20].ground_m == (1.5, -2.25)
 
 
+TOLD = """async (message) => {
+    const { words, step } = (await import("/static/js/lib/problems.js")).told(message);
+    return [words, step];
+}"""
+
+
+def test_the_engines_sentences_are_told_in_words_of_the_pages(browser, project):
+    _, pages = project
+    sentences = {
+        "/a folder/p/project.json: inputs.lens: missing, but needed; calibrate with rooftrack lens.": (
+            "Lens: missing, but needed; calibrate it.",
+            "inputs",
+        ),
+        "project.json: targets.roof.lines.T1 holds no line; draw the band along a strip.": (
+            "Band T1 holds no line; draw the band along a strip.",
+            "regions",
+        ),
+        "project.json: targets[0].lines.L1.from_m: [1, 2] lies outside orthoimage.extent_m; move it.": (
+            "Band L1: [1, 2] lies outside the orthoimage's extent; move it.",
+            "regions",
+        ),
+        "project.json: correspondences: id 3: frame_px [1, 2] is outside the 3 x 4 frame; click it again.": (
+            "Correspondences: pair 3: [1, 2] is outside the 3 x 4 frame; click it again.",
+            "correspondences",
+        ),
+        "/w/p/gps.csv: is empty; export it again.": ("gps.csv: is empty; export it again.", None),
+        "Measured 20 frames/s and 3 m/s.": ("Measured 20 frames/s and 3 m/s.", None),
+        "/etc/x: lies outside the folders Rooftrack may read (/home/x).": (
+            "/etc/x: lies outside the folders Rooftrack may read (/home/x).",
+            None,
+        ),
+    }
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/inputs")
+        for sentence, (words, step) in sentences.items():
+            assert page.evaluate(TOLD, sentence) == [words, step]
+
+
+def test_a_problem_leads_to_the_step_where_it_is_put_right(browser, project):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    document["targets"] = []
+    (folder / "project.json").write_text(json.dumps(document))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/track")
+        problem = page.locator(".note.bad")
+        expect(problem).to_contain_text("Targets: none")
+        expect(problem).not_to_contain_text("project.json")
+        problem.get_by_role("link", name="Regions").click()
+        page.wait_for_url("**/regions")
+
+
 def test_inputs_are_sent_taken_back_and_calibrated(browser, project, tmp_path):
     folder, pages = project
     with watched(browser, pages) as page:

@@ -3,6 +3,7 @@
 import { fill, find, h, svg } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
 import { bindKeys } from "../lib/keys.js";
+import { told } from "../lib/problems.js";
 import { nextTheme, themeIcon } from "../lib/theme.js";
 import { openHelp } from "./help.js";
 import { isRunning } from "./job-card.js";
@@ -117,7 +118,7 @@ export function projectHeader(store, step, events) {
 export function tellConnection(events) {
   const bar = h(
     "p",
-    { class: "connection-bar", role: "alert", hidden: true },
+    { class: "connection-bar", role: "status", hidden: true },
     icon("warn", "small"),
     "The server does not answer – trying again",
   );
@@ -137,7 +138,7 @@ export function statusMark(status, number = "") {
 /** @param {string} id @param {{step: StepName, name: string}} entry @param {number} number @param {{status: StepStatus, message: string} | undefined} state @param {boolean} current */
 function stepLink(id, entry, number, state, current) {
   const status = state?.status ?? "todo";
-  const words = `${entry.name}: ${STATUS_WORDS[status]}${state?.message ? `. ${state.message}` : ""}`;
+  const words = `${entry.name}: ${STATUS_WORDS[status]}${state?.message ? `. ${told(state.message).words}` : ""}`;
   return h(
     "a",
     {

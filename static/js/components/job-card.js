@@ -2,6 +2,7 @@
 
 import { fill, h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
+import { told } from "../lib/problems.js";
 import { count, duration, fixed } from "../lib/format.js";
 import { remove } from "../lib/api.js";
 import { toastError } from "./toast.js";
@@ -39,7 +40,7 @@ export function jobCard({ unit = "" } = {}) {
       cancel.hidden = !isRunning(job);
       bar.hidden = failed;
       stage.textContent = failed
-        ? (job.message ?? "Failed")
+        ? told(job.message || "Failed").words
         : job.state === "queued"
           ? "Waiting for its turn"
           : job.stage || "Starting";

@@ -3,6 +3,7 @@
 import { get, projectPath } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
+import { told } from "../lib/problems.js";
 import { stepUrl } from "../components/header.js";
 import { isRunning, jobCard } from "../components/job-card.js";
 import { openPage } from "../components/page.js";
@@ -135,10 +136,10 @@ async function load() {
 
 /** Only what concerns the files themselves: later steps tell their own. */
 function showProblems() {
-  const own = (store.state.problems ?? []).filter((problem) => problem.startsWith("inputs"));
+  const own = (store.state.problems ?? []).map((problem) => told(problem)).filter(({ step }) => step === "inputs");
   fill(
     problems,
-    own.map((problem) => h("p", { class: "note warn" }, icon("warn"), h("span", {}, problem))),
+    own.map(({ words }) => h("p", { class: "note warn" }, icon("warn"), h("span", {}, words))),
   );
 }
 

@@ -5,6 +5,7 @@ import { fill, find, h, svg } from "../lib/dom.js";
 import { pickFiles } from "../lib/download.js";
 import { ago, fixed } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
+import { told } from "../lib/problems.js";
 import { bindKeys } from "../lib/keys.js";
 import { askText } from "../components/dialog.js";
 import { STEPS, projectsHeader, statusMark, stepUrl } from "../components/header.js";
@@ -65,12 +66,13 @@ function card(project) {
   const next = STEPS.find(({ step }) => !["done", "unneeded"].includes(project.steps[step].status));
   const steps = STEPS.map(({ step, name }, i) => {
     const { status, message } = project.steps[step];
+    const words = told(message).words;
     return h(
       "li",
       {},
       h(
         "a",
-        { href: stepUrl(project.id, step), title: `${name}: ${message}` },
+        { href: stepUrl(project.id, step), title: `${name}: ${words}` },
         statusMark(status, i + 1),
         h("span", { class: "name" }, name),
       ),
@@ -97,7 +99,7 @@ function card(project) {
     h(
       "p",
       { class: "small soft" },
-      next === undefined ? "All steps done." : `${next.name}: ${project.steps[next.step].message}`,
+      next === undefined ? "All steps done." : `${next.name}: ${told(project.steps[next.step].message).words}`,
     ),
   );
 }

@@ -4,12 +4,14 @@ import { get, post, projectPath, remove, sentence } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { count, duration, fixed, millimetres, pixels, plural } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
+import { told } from "../lib/problems.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { stepUrl } from "../components/header.js";
 import { AXES, fetchHistory, fetchResults, METHODS } from "../components/histories.js";
 import { isRunning } from "../components/job-card.js";
 import { note } from "../components/notes.js";
 import { openPage } from "../components/page.js";
+import { problemNote } from "../components/problem-note.js";
 import { Plot } from "../components/plot.js";
 import { segmented } from "../components/segmented.js";
 import { announce, toastError } from "../components/toast.js";
@@ -28,16 +30,6 @@ const STAGES = {
   orthoimage: "Making the orthoimage",
   "drawing figures": "Drawing figures",
 };
-/** Where each part of project.json is decided. @type {{path: string, step: import("../lib/types.js").StepName, name: string}[]} */
-const PLACES = [
-  { path: "inputs", step: "inputs", name: "Inputs" },
-  { path: "orthoimage", step: "orthoimage", name: "Orthoimage" },
-  { path: "correspondences", step: "correspondences", name: "Correspondences" },
-  { path: "targets", step: "regions", name: "Regions" },
-  { path: "moving_regions_px", step: "regions", name: "Regions" },
-  { path: "intervals_s", step: "drift", name: "Drift" },
-  { path: "drift", step: "drift", name: "Drift" },
-];
 
 const page = await openPage("track");
 const { store } = page;
@@ -162,7 +154,7 @@ function onJob(job) {
   const ended = isRunning(track.job) && !isRunning(job);
   track = { ...track, job };
   if (ended) {
-    announce(job.state === "done" ? "The measurement is finished." : `The measurement stopped. ${job.message ?? ""}`);
+    announce(job.state === "done" ? "The measurement is finished." : `The measurement stopped. ${told(job.message ?? "").words}`);
     void catchUp();
   }
   show();
@@ -250,8 +242,8 @@ function showControls() {
   const problems = store.state.problems ?? [];
   const done = results?.ready && !results.stale && !track.resumable;
   const notes = [
-    ...problems.map(problemNote),
-    job?.state === "failed" ? note("bad", job.message ?? "The measurement failed.") : null,
+    ...problems.map((problem) => problemNote("bad", problem, page)),
+    job?.state === "failed" ? problemNote("bad", job.message || "The measurement failed.", page) : null,
     problems.length === 0 && track.resumable ? note("info", stoppedWords()) : null,
     problems.length === 0 && results?.stale
       ? note("warn", store.state.steps.track.message || "The project has changed since these results were made.")
@@ -260,14 +252,6 @@ function showControls() {
     ...(done ? (results?.summary?.warnings ?? []) : []).map((/** @type {string} */ warning) => note("warn", warning)),
   ];
   fill(controls, h("header", {}, h("h2", {}, "Measurement")), notes, buttons(Boolean(done)));
-}
-
-/** A problem of the project, with the page where it is put right. @param {string} problem "path: sentence" */
-function problemNote(problem) {
-  const place = PLACES.find(({ path }) => problem.startsWith(path));
-  const element = note("bad", problem);
-  if (place) element.append(h("a", { class: "note-link", href: stepUrl(page.id, place.step) }, place.name));
-  return element;
 }
 
 /** @param {boolean} done */

@@ -3,6 +3,7 @@
 import { fill, h } from "../../lib/dom.js";
 import { pickFiles } from "../../lib/download.js";
 import { icon } from "../../lib/icons.js";
+import { told } from "../../lib/problems.js";
 import { duration, fixed, size } from "../../lib/format.js";
 import { get, projectPath, upload } from "../../lib/api.js";
 import { chooseFiles } from "../../components/file-browser.js";
@@ -81,7 +82,7 @@ export function inputCard({ projectId, kind, title, why, accept, glyph, onPath, 
         fill(
           body,
           h("p", { class: "path" }, facts.file),
-          h("p", { class: "note bad" }, icon("warn"), h("span", {}, facts.error.message)),
+          h("p", { class: "note bad" }, icon("warn"), h("span", {}, told(facts.error.message).words)),
         );
       else if (facts.reading)
         fill(body, h("p", { class: "path" }, facts.file), h("progress", { "aria-label": "Reading" }));

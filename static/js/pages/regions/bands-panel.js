@@ -2,6 +2,7 @@
 
 import { fill, h } from "../../lib/dom.js";
 import { icon } from "../../lib/icons.js";
+import { told } from "../../lib/problems.js";
 import { count, metres, pixels } from "../../lib/format.js";
 import { numberField } from "../../components/number-field.js";
 import { LINE_NAMES, lengthOf, rounded } from "./band.js";
@@ -29,7 +30,7 @@ export function bandsPanel(element, editor, save) {
     for (const line of LINE_NAMES) rows.get(line)?.show(editor.bands[line] ?? null, preview?.lines?.[line] ?? null);
     message.hidden = !preview?.message;
     message.className = "note";
-    fill(message, icon("info"), h("span", {}, preview?.message ?? ""));
+    fill(message, icon("info"), h("span", {}, told(preview?.message ?? "").words));
   };
 }
 
@@ -133,7 +134,7 @@ function bandRow(line, editor, save) {
         found.textContent =
           line_found === null
             ? metres(lengthOf(band))
-            : line_found.message || `${count(line_found.points)} points, ${pixels(line_found.rms_px)}`;
+            : told(line_found.message ?? "").words || `${count(line_found.points)} points, ${pixels(line_found.rms_px)}`;
       if (band === null) return;
       for (const { read, field: input } of fields) input.set(read(band));
       length.textContent = `${metres(lengthOf(band), 2)} long`;
