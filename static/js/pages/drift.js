@@ -35,6 +35,7 @@ const { store } = page;
 let results = await whenMeasured(
   page,
   "Track the video first; the drift left in its history can then be looked at here.",
+  { byMethod: true },
 );
 
 let axis = viewText("axis") === "y" ? "y" : "x";

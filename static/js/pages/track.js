@@ -7,7 +7,7 @@ import { icon } from "../lib/icons.js";
 import { told } from "../lib/problems.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { stepUrl } from "../components/header.js";
-import { AXES, fetchHistory, fetchResults, METHODS } from "../components/histories.js";
+import { AXES, fetchHistory, fetchResults, methodName, METHODS } from "../components/histories.js";
 import { isRunning } from "../components/job-card.js";
 import { note } from "../components/notes.js";
 import { openPage } from "../components/page.js";
@@ -128,11 +128,18 @@ async function loadResults() {
   show();
 }
 
-/** The finished history takes the place of what was drawn while it grew. */
+/** Whether the video has been measured by the method chosen now: another one has a curve of its own. */
+function isMeasured() {
+  return results?.methods.includes(store.project.method) ?? false;
+}
+
+/** The finished history takes the place of what was drawn while it grew; until there is one, what was measured before. */
 async function loadHistory() {
   const name = currentTarget();
+  const method = isMeasured() ? store.project.method : results?.methods[0];
+  if (!results?.targets.includes(name) && !isMeasured()) return;
   try {
-    const history = await fetchHistory(page.id, name);
+    const history = await fetchHistory(page.id, name, method);
     rows.set(
       name,
       new Map(
@@ -231,7 +238,8 @@ function draw() {
     plot.setData([list.map((row) => row[1]), list.map((row) => row[2 + axis])]);
   });
   const nothing = list.length === 0 && !isRunning(track.job);
-  plotArea.classList.toggle("faint", nothing);
+  const earlier = results?.ready && !isMeasured() && !track.resumable && !isRunning(track.job);
+  plotArea.classList.toggle("faint", nothing || Boolean(earlier));
   empty.hidden = !nothing;
   if (nothing) fill(empty, h("p", {}, "The displacement history appears here while the video is measured."));
 }
@@ -240,24 +248,38 @@ function showControls() {
   const { job } = track;
   if (isRunning(job)) return showRunning(/** @type {Job} */ (job));
   const problems = store.state.problems ?? [];
-  const done = results?.ready && !results.stale && !track.resumable;
+  const done = results?.ready && !results.stale && !track.resumable && isMeasured();
   const notes = [
     ...problems.map((problem) => problemNote("bad", problem, page)),
-    job?.state === "failed" ? problemNote("bad", job.message || "The measurement failed.", page) : null,
+    problems.length === 0 && failure() ? problemNote("bad", failure(), page) : null,
     problems.length === 0 && track.resumable ? note("info", stoppedWords()) : null,
-    problems.length === 0 && results?.stale
-      ? note("warn", store.state.steps.track.message || "The project has changed since these results were made.")
-      : null,
+    problems.length === 0 && !track.resumable && results?.ready ? earlierNote() : null,
     done && job?.state !== "failed" ? note("good", doneWords()) : null,
     ...(done ? (results?.summary?.warnings ?? []) : []).map((/** @type {string} */ warning) => note("warn", warning)),
   ];
   fill(controls, h("header", {}, h("h2", {}, "Measurement")), notes, buttons(Boolean(done)));
 }
 
+/** Why the last measurement failed, as its job says or, after a restart, the step; empty where it did not. */
+function failure() {
+  const { status, message } = store.state.steps.track;
+  if (track.job?.state === "failed") return track.job.message || "The measurement failed.";
+  return status === "error" ? message : "";
+}
+
+/** What the curve shows while it is not the one of the project as it stands; null where it is. */
+function earlierNote() {
+  const of = methodName(results?.methods[0] ?? "").toLowerCase();
+  if (!isMeasured())
+    return note("info", `Not measured by this method yet. The faint curve is the one of the ${of} method.`);
+  if (!results?.stale) return null;
+  return note("warn", "The project has changed since these results were made: the curve and the figures are older.");
+}
+
 /** @param {boolean} done */
 function buttons(done) {
   const off = blocked();
-  const first = track.resumable ? "Resume" : results?.stale ? "Update results" : "Start";
+  const first = track.resumable ? "Resume" : results?.stale && isMeasured() ? "Update results" : "Start";
   const go = h(
     "button",
     { type: "button", class: `button ${done ? "" : "primary"}`, disabled: off, onclick: () => void start(done) },
@@ -377,7 +399,7 @@ function chooseMethod(method) {
 
 function showFacts() {
   const counts = results?.summary?.targets?.[currentTarget()]?.counts;
-  facts.hidden = !results?.ready || !counts || isRunning(track.job);
+  facts.hidden = !results?.ready || !counts || !isMeasured() || isRunning(track.job);
   if (facts.hidden) return;
   const statusLine = (/** @type {string} */ status, /** @type {string} */ words) => [
     h("dt", {}, h("span", { class: `status-key ${status}` }), status),
