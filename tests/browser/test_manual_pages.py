@@ -369,6 +369,31 @@ def test_a_problem_leads_to_the_step_where_it_is_put_right(browser, project):
         page.wait_for_url("**/regions")
 
 
+def test_what_is_missing_is_named_with_the_way_to_it(browser, project, server):
+    _, pages = project
+    _, address = server
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")  # a video, but no cloud
+        ready(page, "Reference frame")
+        ortho = pane(page, "Orthoimage")
+        expect(ortho.get_by_role("link", name="Choose a point cloud")).to_be_visible()
+        expect(ortho.get_by_role("link", name="Make the orthoimage")).to_have_count(0)
+        ortho.click(position={"x": 60, "y": 300})
+        expect(ortho.locator(".pane-note")).to_have_attribute("data-clicks", "1")
+        expect(page.get_by_text("Nothing was placed.")).to_be_attached()
+        page.goto(f"{pages}/orthoimage")
+        expect(page.get_by_role("button", name="Make the orthoimage")).to_be_disabled()
+        made = page.request.post(
+            f"{address}/api/projects", data={"name": "bare"}, headers={"X-Rooftrack": "1", "Origin": address}
+        ).json()["id"]
+        page.goto(f"{address}/p/{made}/regions")
+        expect(page.get_by_text("Click the corners in the left picture")).to_be_visible()
+        plan = pane(page, "Orthorectified")
+        expect(plan.get_by_role("link", name="Place correspondences")).to_have_count(0)
+        plan.get_by_role("link", name="Inputs").click()
+        page.wait_for_url("**/inputs")
+
+
 def test_inputs_are_sent_taken_back_and_calibrated(browser, project, tmp_path):
     folder, pages = project
     with watched(browser, pages) as page:

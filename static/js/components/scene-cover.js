@@ -2,6 +2,7 @@
 // another project has it, this window must not show that project's points as its own.
 
 import { fill, h } from "../lib/dom.js";
+import { noteContent } from "./problem-note.js";
 
 /** @typedef {{ready: boolean, message: string, owner: string | null}} SceneAnswer */
 
@@ -24,7 +25,7 @@ export class SceneCover {
   show({ ready, message, owner }) {
     if (this.isElsewhere(owner)) this.tell(`The 3D view shows “${owner}” in another window.`, takeButton(this.onTake));
     else if (ready) this.tell();
-    else this.tell(message);
+    else this.tell(...noteContent(message, { id: this.projectId, step: "orthoimage" }));
   }
 
   /** Cover the view with words; without any, uncover it. @param {...(Node | string)} content */

@@ -11,6 +11,7 @@ import { isRunning, jobCard } from "../components/job-card.js";
 import { note } from "../components/notes.js";
 import { numberField } from "../components/number-field.js";
 import { openPage } from "../components/page.js";
+import { noteContent, stepButton } from "../components/problem-note.js";
 import { Pane } from "../components/pane.js";
 import { paneChrome } from "../components/pane-chrome.js";
 import { PaneImage } from "../components/pane-image.js";
@@ -167,6 +168,7 @@ const make = h(
 );
 const facts = h("div", { class: "settings" });
 const job = jobCard();
+let making = false;
 fill(
   find("#raster"),
   h("header", {}, h("h2", {}, "Orthoimage"), h("span", { class: "badge", id: "raster-state" })),
@@ -204,7 +206,8 @@ async function start() {
 function showJob(running) {
   if (running === null || !["orthoimage", "cloud"].includes(running.kind)) return;
   job.show(running);
-  make.disabled = isRunning(running);
+  making = isRunning(running);
+  make.disabled = making;
   if (running.state === "done") void load();
 }
 
@@ -214,6 +217,7 @@ function showSettings() {
   groundLevel.set(orthoimage.ground_z_m);
   extent.show(orthoimage.extent_m, grid === null ? null : extentOf(grid));
   inView.disabled = grid === null;
+  make.disabled = store.project.inputs.cloud === null || making;
 }
 
 /** Outer edges of a raster. @param {OrthoGrid} raster @returns {Extent} */
@@ -241,14 +245,11 @@ async function load() {
     showSettings();
     if (answer.job) showJob(answer.job);
     if (answer.ready) await showPicture(answer);
-    else
-      chrome.setNote(
-        store.project.inputs.cloud === null
-          ? "This project has no point cloud."
-          : "There is no orthoimage yet: choose pixel and extent on the right, and make it.",
-      );
+    else if (store.project.inputs.cloud === null)
+      chrome.setNote("This project has no point cloud.", stepButton(page.id, "inputs", "Choose a point cloud"));
+    else chrome.setNote("There is no orthoimage yet: choose pixel and extent on the right, and make it.");
   } catch (error) {
-    chrome.setNote(sentence(error));
+    chrome.setNote(...noteContent(error, page));
   }
 }
 
