@@ -27,7 +27,7 @@ from core.errors import InputError
 from core.lens import read_lens, require_image_size
 from core.project import Project
 from core.storage import File
-from core.validation import read_gps
+from core.validation import gps_columns, read_gps
 from core.video import frame_index
 
 router = APIRouter(prefix="/api")
@@ -53,8 +53,17 @@ def browse(here: Here, dir: str | None = None, kind: str | None = None) -> dict[
         "dir": str(folder),
         "parent": str(parent) if parent else None,
         "roots": [str(root) for root in here.places.roots],
+        "home": str(Path.home()),
+        "workspace": str(here.workspace.folder),
         "entries": listed,
     }
+
+
+@router.get("/browse/which")
+def which(path: str, here: Here) -> dict[str, Any]:
+    """Return the file at a path that was typed, or null where it is a folder."""
+    place = here.places.allowed(path)
+    return {"file": None if place.is_dir() else str(here.places.file(path))}
 
 
 def _entry(entry: os.DirEntry[str]) -> dict[str, Any] | None:
@@ -115,13 +124,16 @@ def _understood(here: Context, folder: ProjectFolder, project: Project, kind: st
     named = folder.named_input(kind, project)
     if named is None:
         return None
+    found: dict[str, Any] = {}
     readers: dict[str, Callable[..., dict[str, Any]]] = {"video": _video, "cloud": _cloud, "lens": _lens, "gps": _gps}
     try:
         file = folder.require_video(project) if kind == "video" else folder.require_input(kind, project)
-        facts = {"file": named, "path": str(file), "size": fingerprint(file)[1]}
+        if kind == "gps":
+            found["columns_found"] = gps_columns(Path(str(file)))
+        facts = {"file": named, "path": str(file), "size": fingerprint(file)[1], **found}
         return facts | readers[kind](here, folder, project, file)
     except (InputError, ApiError) as error:
-        return {"file": named, "error": {"message": problem_of(error)}}
+        return {"file": named, "error": {"message": problem_of(error)}, **found}
 
 
 def _video(here: Context, folder: ProjectFolder, project: Project, video: File) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from playwright.sync_api import Page, expect
 from core.lens import read_lens
 from core.project import read_project
 from tests.browser.hands import centre_of, fitted, zoomed
-from tests.browser.live import SAMPLE, ask, ask_bytes, free_port, serving, watched
+from tests.browser.live import SAMPLE, ask, ask_bytes, eventually, free_port, serving, watched
 from tests.browser.steps import (
     FRAME_SIZE,
     draw_bands,
@@ -285,7 +285,7 @@ def test_the_columns_of_another_gps_file_are_told(browser, project):
         card.get_by_role("button", name="Columns…").click()
         dialog = page.get_by_role("dialog")
         for label, column in (("Time, s", "seconds"), ("East, m", "E"), ("North, m", "N")):
-            dialog.get_by_label(label).fill(column)
+            dialog.get_by_label(label).select_option(column)
         dialog.get_by_label("Antenna east").fill("0.5")
         dialog.get_by_label("Antenna north").fill("-1.25")
         dialog.get_by_role("button", name="Save").click()
@@ -367,6 +367,28 @@ def test_a_problem_leads_to_the_step_where_it_is_put_right(browser, project):
         expect(problem).not_to_contain_text("project.json")
         problem.get_by_role("link", name="Regions").click()
         page.wait_for_url("**/regions")
+
+
+def test_a_file_is_chosen_by_typing_its_path(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/inputs")
+        lens = page.locator(".input-card[data-kind=lens]")
+        (folder / "again.yaml").write_text((SAMPLE / "lens.yaml").read_text())
+        lens.get_by_role("button", name="Choose on this computer").click()
+        path = page.get_by_label("Path of a file or folder")
+        expect(path).to_have_value(re.compile("^/"))
+        path.fill(str(folder / "none.yaml"))
+        path.press("Enter")
+        expect(page.get_by_role("dialog")).to_contain_text("no such file")
+        path.fill(str(folder))
+        path.press("Enter")
+        expect(page.get_by_role("option", name="again.yaml")).to_be_visible()
+        path.fill(f'"{folder / "again.yaml"}"')
+        path.press("Enter")
+        expect(page.get_by_role("dialog")).to_have_count(0)
+        saved(page)
+        eventually(lambda: read_project(folder).inputs.lens == "again.yaml")
 
 
 def test_what_is_missing_is_named_with_the_way_to_it(browser, project, server):

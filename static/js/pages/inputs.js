@@ -64,9 +64,11 @@ const calibrate = h(
   icon("target", "small"),
   "Calibrate…",
 );
+/** @type {string[]} of the GPS file */
+let columnsFound = [];
 const columns = h(
   "button",
-  { class: "button small", type: "button", onclick: () => void gpsSettings(store).catch(toastError) },
+  { class: "button small", type: "button", onclick: () => void gpsSettings(store, columnsFound).catch(toastError) },
   icon("edit", "small"),
   "Columns…",
 );
@@ -128,7 +130,8 @@ async function load() {
   try {
     const facts = await get(projectPath(page.id, "inputs"));
     for (const [kind, card] of cards) card.show(facts[kind]);
-    columns.hidden = facts.gps === null;
+    columnsFound = facts.gps?.columns_found ?? [];
+    columns.hidden = columnsFound.length === 0;
   } catch (error) {
     toastError(error);
   }

@@ -10,8 +10,19 @@ const COLUMNS = /** @type {const} */ ([
   ["y", "North, m"],
 ]);
 
-/** @param {import("../../lib/store.js").ProjectStore} store */
-export async function gpsSettings(store) {
+/** The columns of the file; what was chosen and is not among them has to be chosen anew. @param {string[]} columns @param {string} chosen */
+function columnChoice(columns, chosen) {
+  const known = columns.includes(chosen);
+  return h(
+    "select",
+    { class: "input", required: true },
+    known ? null : h("option", { value: "", selected: true, disabled: true }, `no “${chosen}” here`),
+    columns.map((name) => h("option", { value: name, selected: name === chosen }, name)),
+  );
+}
+
+/** @param {import("../../lib/store.js").ProjectStore} store @param {string[]} columns found in the file */
+export async function gpsSettings(store, columns) {
   const now = store.project.inputs.gps;
   if (now === null) return;
   const wanted = structuredClone(now);
@@ -20,15 +31,9 @@ export async function gpsSettings(store) {
     title: "GPS columns and antenna",
     body: (close) => {
       const inputs = COLUMNS.map(([key, label]) => {
-        const input = h("input", {
-          class: "input",
-          id: `gps-${key}`,
-          type: "text",
-          required: true,
-          value: now[key],
-          spellcheck: "false",
-          oninput: () => void (wanted[key] = input.value.trim()),
-        });
+        const input = columnChoice(columns, now[key]);
+        input.id = `gps-${key}`;
+        input.addEventListener("change", () => (wanted[key] = input.value));
         return h("div", { class: "field" }, h("label", { class: "label", for: `gps-${key}` }, label), input);
       });
       const antenna = /** @type {const} */ ([
