@@ -93,6 +93,7 @@ def test_a_server_that_is_gone_is_noticed_and_found_again(browser, scene, tmp_pa
         with serving(tmp_path, port) as address:
             page.goto(f"{address}/p/sample/track")
             page.get_by_role("button", name="Start").click()
+            expect(page.get_by_text("The first values appear after 8 frames.")).to_be_visible()
             page.wait_for_function("() => parseInt(document.querySelector('.figures .value')?.textContent) > 5")
             expect(bar).to_be_hidden()
         expect(bar).to_be_visible(timeout=20_000)

@@ -18,7 +18,7 @@ import { announce, toastError } from "../components/toast.js";
 
 /** @typedef {import("../lib/types.js").Job} Job */
 /** @typedef {[frame: number, time_s: number, dx_m: number | null, dy_m: number | null, status: string]} Row */
-/** @typedef {{job: Job | null, resumable: boolean, frames_done: number, frames_total: number, message: string | null, preview: Record<string, Row[]>}} TrackState */
+/** @typedef {{job: Job | null, resumable: boolean, frames_done: number, frames_total: number, message: string | null, first_values_after: number, preview: Record<string, Row[]>}} TrackState */
 
 // The stage of a measurement that counts frames; the others are short.
 const MEASURING = "measuring";
@@ -35,7 +35,7 @@ const page = await openPage("track");
 const { store } = page;
 
 /** @type {TrackState} */
-let track = { job: null, resumable: false, frames_done: 0, frames_total: 0, message: null, preview: {} };
+let track = { job: null, resumable: false, frames_done: 0, frames_total: 0, message: null, first_values_after: 0, preview: {} };
 /** Rows by target and frame: chunks may arrive in any order. @type {Map<string, Map<number, Row>>} */
 const rows = new Map();
 /** @type {import("../components/histories.js").Results | null} */
@@ -237,11 +237,14 @@ function draw() {
     plot.statuses = list.map((row) => row[4] ?? "ok");
     plot.setData([list.map((row) => row[1]), list.map((row) => row[2 + axis])]);
   });
-  const nothing = list.length === 0 && !isRunning(track.job);
+  const nothing = list.length === 0;
   const earlier = results?.ready && !isMeasured() && !track.resumable && !isRunning(track.job);
   plotArea.classList.toggle("faint", nothing || Boolean(earlier));
   empty.hidden = !nothing;
-  if (nothing) fill(empty, h("p", {}, "The displacement history appears here while the video is measured."));
+  const words = isRunning(track.job)
+    ? `The first values appear after ${plural(track.first_values_after, "frame")}.`
+    : "The displacement history appears here while the video is measured.";
+  if (nothing) fill(empty, h("p", {}, words));
 }
 
 function showControls() {
