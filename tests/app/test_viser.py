@@ -18,6 +18,9 @@ from websockets.exceptions import InvalidStatus
 
 from app.context import Context
 from app.scene3d import CLIENT_FILE, TOKEN_HEADER, CloudView, Scene3D
+from app.scenes import _ground
+from app.sites import Site
+from core.cloud import GroundPlane, make_cloud
 
 HOST = {"Host": "127.0.0.1:8000"}
 ORIGIN = HOST | {"Origin": "http://127.0.0.1:8000"}
@@ -206,3 +209,17 @@ def test_one_scene_is_handed_from_project_to_project_and_never_holds_two(
     assert ("small", "scene", {"owner": "empty"}) in told
     assert (show("small")["ready"], show("small")["points_shown"]) == (False, 0)
     assert show("small", take=True)["ready"]
+
+
+def test_a_ground_at_zero_has_no_sign() -> None:
+    plane = GroundPlane(
+        at_m=(0.0, 0.0, -0.001),
+        slope=(0.0, 0.0),
+        elevation_std_m=0.0,
+        elevation_p5_m=0.0,
+        elevation_p95_m=0.0,
+        ground_points=10,
+        area_m2=1.0,
+    )
+    cloud = make_cloud(np.zeros((4, 3)))
+    assert "z = 0.00 m" in _ground(Site("key", cloud, plane)).label

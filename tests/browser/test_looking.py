@@ -166,6 +166,8 @@ def test_the_scene_of_one_project_is_not_shown_as_anothers(browser, pages):
         scene = first.locator("iframe.scene-frame")
         expect(first.locator("#scene-settings")).to_contain_text("drawn; the engine uses all", timeout=60_000)
         expect(scene).to_be_visible()
+        inside = first.frame_locator("iframe.scene-frame")
+        expect(inside.locator("[data-dock-tab=viser-control-panel]")).to_be_hidden()
         made = second.request.post(
             f"{address}/api/projects", data={"name": "empty"}, headers={"X-Rooftrack": "1", "Origin": address}
         ).json()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from urllib.error import HTTPError
 
 import cv2
 import numpy as np
@@ -367,6 +368,37 @@ def test_a_problem_leads_to_the_step_where_it_is_put_right(browser, project):
         expect(problem).not_to_contain_text("project.json")
         problem.get_by_role("link", name="Regions").click()
         page.wait_for_url("**/regions")
+
+
+def test_a_narrow_window_reads_downwards(browser, project):
+    _, pages = project
+    with watched(browser, pages, viewport={"width": 800, "height": 900}) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        stage, side = page.locator(".stage").bounding_box(), page.locator(".side").bounding_box()
+        assert (stage["width"], side["x"], side["width"]) == (800, 0, 800)
+        assert side["y"] >= stage["y"] + stage["height"]
+        expect(page.locator(".brand-name")).to_be_hidden()
+        assert page.evaluate("document.documentElement.scrollWidth") == 800
+        page.set_viewport_size({"width": 1920, "height": 1080})
+        page.goto(f"{pages}/inputs")
+        assert page.locator(".card-grid").bounding_box()["width"] > 1400
+
+
+def test_regions_are_numbered_and_surrounded_alike(browser, project, truth):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions")
+        ready(page, "Orthorectified")
+        numbers = [page.locator(f"[data-id='moving:number:{i}'] text") for i in range(len(truth.moving_regions_px))]
+        assert [number.text_content() for number in numbers] == [str(i + 1) for i in range(len(numbers))]
+        surround = page.evaluate("getComputedStyle(document.querySelector('.pane')).backgroundColor")
+    levels = [int(level) for level in re.findall(r"\d+", surround)]
+    outside = "".join(f"{level:02x}" for level in levels)
+    picture = cv2.imdecode(np.frombuffer(ask_bytes(pages, f"rectified.jpg?outside={outside}"), np.uint8), 1)
+    assert picture[0, 0, ::-1] == pytest.approx(levels, abs=4)  # JPEG
+    with pytest.raises(HTTPError, match="422"):
+        ask_bytes(pages, "rectified.jpg?outside=red")
 
 
 def test_a_file_is_chosen_by_typing_its_path(browser, project):

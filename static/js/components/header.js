@@ -169,7 +169,7 @@ function brand() {
     }),
     svg("circle", { cx: 12, cy: 15, r: 2.2, fill: "#ffd23f" }),
   );
-  return h("a", { class: "brand", href: "/", title: "All projects" }, logo, "Rooftrack");
+  return h("a", { class: "brand", href: "/", title: "All projects" }, logo, h("span", { class: "brand-name" }, "Rooftrack"));
 }
 
 /** @param {"undo" | "redo"} name @param {string} label @param {() => void} run */

@@ -6,6 +6,18 @@ import { noteContent } from "./problem-note.js";
 
 /** @typedef {{ready: boolean, message: string, owner: string | null}} SceneAnswer */
 
+// The viewer's own panel, in its own looks, holds nothing that our pages do not have.
+const OWN_PANEL = '[data-floating-window]:has([data-dock-tab="viser-control-panel"])';
+
+/** The 3D view itself, with no more on it than the scene. @param {string} title */
+export function sceneFrame(title) {
+  const frame = h("iframe", { class: "scene-frame", title, src: "/viser/?hideViserLogo" });
+  frame.addEventListener("load", () =>
+    frame.contentDocument?.head.append(h("style", {}, `${OWN_PANEL} { display: none !important; }`)),
+  );
+  return frame;
+}
+
 export class SceneCover {
   /** @param {HTMLElement} host what holds the 3D view @param {string} projectId @param {() => void} onTake the scene is wanted here */
   constructor(host, projectId, onTake) {

@@ -3,7 +3,7 @@
 import { post, projectPath, sentence } from "../lib/api.js";
 import { h } from "../lib/dom.js";
 import { pointsShown } from "../lib/graphics.js";
-import { SceneCover } from "./scene-cover.js";
+import { SceneCover, sceneFrame } from "./scene-cover.js";
 
 const LEAST_PAUSE_MS = 80;
 const ASKS_AGAIN_MS = 1000;
@@ -53,13 +53,7 @@ export class SceneView {
     this.#active = active;
     if (!active) return;
     if (this.host.querySelector("iframe") === null) {
-      this.host.prepend(
-        h("iframe", {
-          class: "scene-frame",
-          title: "3-D scene: cloud, camera and roof lines",
-          src: "/viser/?hideViserLogo",
-        }),
-      );
+      this.host.prepend(sceneFrame("3-D scene: cloud, camera and roof lines"));
     }
     this.#wish.points ||= pointsShown();
     this.show(frame);

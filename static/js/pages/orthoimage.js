@@ -16,6 +16,7 @@ import { Pane } from "../components/pane.js";
 import { paneChrome } from "../components/pane-chrome.js";
 import { PaneImage } from "../components/pane-image.js";
 import { paneKeys } from "../components/pane-keys.js";
+import { sceneFrame } from "../components/scene-cover.js";
 import { segmented } from "../components/segmented.js";
 import { toast, toastError } from "../components/toast.js";
 import { extentFields } from "./orthoimage/extent-fields.js";
@@ -78,10 +79,7 @@ function showTab(tab) {
 const isSceneOpen = () => find("#scene").querySelector("iframe") !== null;
 
 function openScene() {
-  if (!isSceneOpen())
-    find("#scene").prepend(
-      h("iframe", { class: "scene-frame", title: "3D scene of the point cloud", src: "/viser/?hideViserLogo" }),
-    );
+  if (!isSceneOpen()) find("#scene").prepend(sceneFrame("3D scene of the point cloud"));
   scene.send();
 }
 

@@ -86,7 +86,8 @@ function card(project) {
       alt: "",
       loading: "lazy",
       src: `/api/${projectPath(project.id, "frames/0.jpg", { w: 360 })}`,
-      onerror: (/** @type {Event} */ event) => /** @type {Element} */ (event.target).classList.add("missing"),
+      onerror: (/** @type {Event} */ event) =>
+        /** @type {Element} */ (event.target).replaceWith(h("div", { class: "still placeholder" }, icon("video"))),
     }),
     h(
       "header",

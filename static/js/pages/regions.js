@@ -14,6 +14,7 @@ import { paneChrome } from "../components/pane-chrome.js";
 import { PaneImage } from "../components/pane-image.js";
 import { nudgeKeys, paneKeys } from "../components/pane-keys.js";
 import { openPage } from "../components/page.js";
+import { colourOf } from "../components/palette.js";
 import { noteContent, stepButton } from "../components/problem-note.js";
 import { PolygonEditor } from "../components/polygon-editor.js";
 import { segmented } from "../components/segmented.js";
@@ -77,6 +78,7 @@ const moving = new PolygonEditor(framePane, {
   save: (label, polygons, merge) =>
     void store.edit(label, (draft) => void (draft.moving_regions_px = polygons.map(tenths)), { merge }),
   accepts: () => framePane.image !== null,
+  numbered: true,
 });
 /** @type {PolygonEditor} */
 const region = new PolygonEditor(planPane, {
@@ -329,6 +331,12 @@ async function loadFrame() {
   }
 }
 
+/** The colour around both pictures, as six hexadecimal digits. */
+function surround() {
+  const [red, green, blue] = (colourOf(planPane.element, "--image-surround").match(/\d+/g) ?? []).map(Number);
+  return [red, green, blue].map((level) => (level ?? 0).toString(16).padStart(2, "0")).join("");
+}
+
 async function loadPlan() {
   if (planPane.image === null) planChrome.setNote("Laying the frame on the ground…");
   try {
@@ -345,7 +353,7 @@ async function loadPlan() {
     }
     grid = answer.grid;
     planPane.setImage(
-      await PaneImage.load(`/api/${projectPath(page.id, "rectified.jpg", { v: store.revision })}`, {
+      await PaneImage.load(`/api/${projectPath(page.id, "rectified.jpg", { v: store.revision, outside: surround() })}`, {
         onLevel: () => planPane.invalidate(),
       }),
     );
