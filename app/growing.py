@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _PAUSE_S = 1.0
 # Fewer new frames are not worth a solve of their own.
-_LEAST_FRAMES = 8
+LEAST_FRAMES = 8
 
 Row = list[Any]
 log = logging.getLogger("rooftrack")
@@ -80,7 +80,7 @@ def _look(here: Context, folder: ProjectFolder, inputs: LoadedInputs, growth: _G
         if number is None:
             return
         recording = store.load(number, after=growth.last_frame)
-    if len(recording.frame) < _LEAST_FRAMES:
+    if len(recording.frame) < LEAST_FRAMES:
         return
     growth.last_frame = int(recording.frame[-1])
     solution = solve(recording, _plain(inputs.project), inputs.lens, inputs.relief, has_lens=inputs.has_lens)

@@ -112,6 +112,7 @@ class Scene3D:
         self._shown = _Shown()
         self._pick: Pick | None = None
         self._lock = threading.RLock()
+        self._turn = threading.Lock()
 
     @property
     def port(self) -> int:
@@ -128,16 +129,34 @@ class Scene3D:
         """(3,) world place that is the scene's origin."""
         return self._shown.origin_m
 
+    @contextlib.contextmanager
+    def turn(self, project: str, *, take: bool) -> Iterator[bool]:
+        """Hold the scene for a project, cleared of any other; yield False where another has it and keeps it.
+
+        There is one scene for all windows, so without this one project's points would be drawn among another's.
+        """
+        with self._turn:
+            mine = take or self._shown.project in (None, project)
+            if mine and self._shown.project != project:
+                self.clear(project)
+            yield mine
+
+    def clear(self, project: str) -> None:
+        """Show nothing, as a project's scene."""
+        with self._lock:
+            self._pick = None
+            for nodes in self._shown.nodes.values():
+                _remove(nodes)
+            self._shown = _Shown(project)
+
     def open(self, project: str, origin_m: Floats, pick: Pick) -> None:
         """Show a project; `pick` gets the ray, world origin and direction, of every click into the scene."""
         with self._lock:
             server = self._started()
+            if self._shown.project != project or not np.array_equal(self._shown.origin_m, origin_m):
+                self.clear(project)
+                self._shown.origin_m = np.asarray(origin_m, dtype=np.float64)
             self._pick = pick
-            if self._shown.project == project and np.array_equal(self._shown.origin_m, origin_m):
-                return
-            for nodes in self._shown.nodes.values():
-                _remove(nodes)
-            self._shown = _Shown(project, np.asarray(origin_m, dtype=np.float64))
             server.scene.world_axes.visible = False
 
     def close(self) -> None:

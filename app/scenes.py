@@ -47,16 +47,30 @@ class View:
     show: Mapping[str, bool] | None = None
 
 
-def show(here: Context, folder: ProjectFolder, view: View) -> dict[str, Any]:
-    """Bring the scene up to date with a project and a view; return what is shown of it, or why nothing is yet."""
+def show(here: Context, folder: ProjectFolder, view: View, *, take: bool = False) -> dict[str, Any]:
+    """Bring the scene up to date with a project and a view; return what is shown of it, or why nothing is yet.
+
+    Args:
+        take: whether to take the one scene from another project that has it; otherwise it is left to that one.
+    """
+    with here.scene.turn(folder.id, take=take) as mine:
+        shown = _show(here, folder, view) if mine else _nothing("")
+        return shown | {"owner": here.scene.project}
+
+
+def _show(here: Context, folder: ProjectFolder, view: View) -> dict[str, Any]:
     project = folder.load().project
     try:
         site = here.sites.site(folder, project) if project.inputs.cloud else None
-    except NotYet as error:
+    except NotYet as error:  # what is shown of this project stays meanwhile
         return _nothing(error.message)
+    except (InputError, ApiError) as error:
+        here.scene.clear(folder.id)
+        return _nothing(problem_of(error))
     fit, problem = _fit(here, folder, project)
-    if site is None and fit is None:
-        return _nothing(problem)
+    if site is None and (fit is None or fit.pose is None):
+        here.scene.clear(folder.id)
+        return _nothing("There is no point cloud to show; choose one in the inputs.")
     origin = site.cloud.origin_m if site is not None else np.array([*_origin_of(fit), 0.0])
     here.scene.open(folder.id, origin, lambda start, along: _picked(here, folder, start, along))
     shown = _show_site(here, folder, site, view) if site is not None else 0
@@ -121,7 +135,7 @@ def _ground(site: Site) -> GroundView:
     plane = site.plane
     size = float(np.sqrt(max(plane.area_m2, 1.0))) * 1.2
     label = (
-        f"Ground plane z = {plane.at_m[2]:.2f} m, tilt {np.degrees(plane.tilt_rad):.2f} deg, "
+        f"Ground plane z = {round(plane.at_m[2], 2) + 0.0:.2f} m, tilt {np.degrees(plane.tilt_rad):.2f} deg, "
         f"elevation spread {100 * plane.elevation_std_m:.1f} cm"
     )
     return GroundView(np.array(plane.at_m), plane.slope, size, label)

@@ -32,7 +32,7 @@ from app.outcome import Outcomes
 from app.places import Places
 from app.scene3d import Scene3D
 from app.sites import Sites
-from app.steps import STEPS, steps_of
+from app.steps import SETTLED, STEPS, steps_of
 from app.store import ProjectFolder, Workspace
 from core.errors import InputError
 from core.locks import take_lock
@@ -151,7 +151,7 @@ def _add_pages(app: FastAPI) -> None:
         folder = here.workspace.open(project_id)
         try:
             steps = steps_of(here, folder, folder.load().project, look=False).steps
-            step = next((name for name in STEPS if steps[name]["status"] != "done"), STEPS[-1])
+            step = next((name for name in STEPS if steps[name]["status"] not in SETTLED), STEPS[-1])
         except InputError:
             step = STEPS[0]
         return RedirectResponse(f"/p/{project_id}/{step}")

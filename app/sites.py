@@ -91,6 +91,16 @@ class Sites:
         except (InputError, ApiError):
             return None
 
+    def require_usable(self, folder: ProjectFolder, project: Project) -> None:
+        """Start nothing, and pass over a cloud that has not been read.
+
+        Raises:
+            InputError: the cloud has been read and cannot be used.
+        """
+        path = folder.input_path("cloud", project)
+        if path is not None:
+            _known(folder, site_key(path, project))
+
     def relief(self, folder: ProjectFolder, project: Project) -> Relief | None:
         """Return the ground's relief as the engine uses it; until a job has made it, the one of a moment ago."""
         try:

@@ -5,26 +5,33 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app import orthoimages, outcome
 from app.errors import ApiError
-from app.reference import reference_fit
+from app.frames import Fingerprint, fingerprint
+from app.reference import lens_of, reference_fit
 from app.store import ProjectFolder, problem_of, stored_inputs
 from app.videos import is_read_through, video_info
 from core.check import check_project
 from core.errors import InputError
-from core.project import Project, project_json
+from core.project import GpsInput, Project, project_json
+from core.validation import GpsRecord, read_gps
 from core.video import frame_index
 
 if TYPE_CHECKING:
     from app.context import Context
 
+# The states of a step that leave nothing to do in it.
+SETTLED = ("done", "unneeded")
 STEPS = ("inputs", "orthoimage", "correspondences", "regions", "track", "review", "drift", "export")
 # A leave-one-out error this many times the median of all is a click to look at again (and at least this many pixels).
 _BAD_CLICK_RATIO, _BAD_CLICK_PX = 3.0, 1.5
 _GOOD_COVERAGE = 0.5
+
+_NO_VIDEO = "inputs.video: none is given yet; choose the video in the inputs."
 
 Step = dict[str, str]
 
@@ -110,16 +117,44 @@ def _inputs(seen: _Look) -> Step:
         return _step("todo", "Choose the video, or send it.")
     if missing:
         return _step("error", f"Not found: {', '.join(missing)}; choose it again.")
+    if wrong := _unusable(seen):
+        return _step("error", wrong)
     if seen.project.method == "geometric" and "lens" not in given:
         return _step("warn", "The geometric method needs the lens; calibrate it or choose its file.")
     return _step("done", ", ".join(given))
 
 
+def _unusable(seen: _Look) -> str:
+    """Return what is wrong with the first input that is there and cannot be used; empty where nothing is known to be.
+
+    A cloud takes long to read: of it, only what reading it showed before is told.
+    """
+    folder, project = seen.folder, seen.project
+    try:
+        video = folder.require_video(project)
+        if isinstance(video, Path):  # one far away is looked at by whoever needs its frames
+            video_info(video)
+            lens_of(folder, project)
+        seen.here.sites.require_usable(folder, project)
+        if project.inputs.gps is not None:
+            _read_gps(fingerprint(folder.require_input("gps", project)), project.inputs.gps)
+    except (InputError, ApiError) as error:
+        return problem_of(error).replace(f"{folder.folder}{os.sep}", "")
+    return ""
+
+
+@lru_cache(maxsize=32)
+def _read_gps(file: Fingerprint, columns: GpsInput) -> GpsRecord:
+    return read_gps(Path(file[0]), columns)
+
+
 def _orthoimage(seen: _Look) -> Step:
     if seen.is_running("orthoimage"):
         return _step("running", "The orthoimage is being made.")
+    if seen.project.inputs.cloud is None and seen.project.correspondences:
+        return _step("unneeded", "Without a cloud, ground coordinates are typed in.")
     if seen.project.inputs.cloud is None:
-        return _step("done", "Without a cloud, ground coordinates are typed in.")
+        return _step("todo", "Choose the point cloud in the inputs; without one, ground coordinates are typed in.")
     state = orthoimages.state_of(seen.folder, seen.project)
     if not state.ready:
         return _step("todo", "Make the orthoimage from the cloud.")
@@ -218,6 +253,8 @@ def _problems(folder: ProjectFolder, project: Project, look: bool) -> list[str] 
     if look and key not in _known_problems:
         place = f"{folder.folder}{os.sep}"
         found = [problem.replace(place, "") for problem in check_project(folder.folder, with_cloud=False)]
+        if folder.named_input("video", project) is None:
+            found = [_NO_VIDEO if problem.startswith(f"{project.inputs.video}:") else problem for problem in found]
         while len(_known_problems) >= _PROBLEMS_KEPT:
             _known_problems.pop(next(iter(_known_problems)), None)
         _known_problems[key] = found

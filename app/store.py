@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 from app.errors import ApiError, Conflict, Invalid, Missing, Refused
 from app.history import HISTORY_FILE, Entry, Head, History
+from app.intake import require_usable
 from app.places import Places
 from core.errors import InputError
 from core.project import (
@@ -135,8 +136,17 @@ class ProjectFolder:
         Raises:
             Refused: outside the allowed folders.
         """
-        stored = stored_inputs((project or self.load().project).inputs)[kind]
+        stored = self.named_input(kind, project or self.load().project)
         return None if stored is None else self._file_of(kind, stored)
+
+    def named_input(self, kind: str, project: Project) -> str | None:
+        """Return what a project names as an input, where a person named it; None where none is given.
+
+        A project needs the name of a video from the beginning, so one made without carries a name nobody chose.
+        """
+        stored = stored_inputs(project.inputs)[kind]
+        to_come = kind == "video" and stored == VIDEO_TO_COME and not (self.folder / stored).exists()
+        return None if to_come else stored
 
     def input_path(self, kind: str, project: Project | None = None) -> Path | None:
         """Return where an input lies on this computer, or None where none is given there.
@@ -231,7 +241,11 @@ class ProjectFolder:
         project = Project.model_validate(document)
         before = stored_inputs(self._read().inputs)
         changed = {kind: file for kind, file in stored_inputs(project.inputs).items() if file != before[kind]}
-        named = {kind: self._named(self._file_of(kind, file)) for kind, file in changed.items() if file is not None}
+        files = {kind: self._file_of(kind, file) for kind, file in changed.items() if file is not None}
+        for kind, file in files.items():
+            if isinstance(file, Path) and file.is_file():
+                require_usable(kind, file, file.name)
+        named = {kind: self._named(file) for kind, file in files.items()}
         return project.model_copy(update={"inputs": with_inputs(project.inputs, named)})
 
     def _file_of(self, kind: str, stored: str) -> File:
@@ -335,9 +349,11 @@ class Workspace:
         """Make a project folder; `files` are absolute paths of its inputs.
 
         Raises:
-            ApiError: a file is outside the allowed folders or missing; nothing is left behind.
+            ApiError: a file is outside the allowed folders, missing or not what it should be; nothing is left behind.
         """
         given = {kind: self.places.file(file) for kind, file in files.items() if file}
+        for kind, file in given.items():
+            require_usable(kind, file, file.name)
         with self._new_folder(name) as folder:
             relative = {kind: Path(os.path.relpath(file, folder)).as_posix() for kind, file in given.items()}
             inputs = with_inputs(Inputs(video=VIDEO_TO_COME), relative)

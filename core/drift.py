@@ -51,12 +51,22 @@ class CornerSweep:
     Attributes:
         corners_hz: (C,).
         rms_m: (C, K) about zero, over the interval; NaN where the record is too short for the corner.
-        knee_hz: where a further increase stops paying, or None where the curve has no such place.
+        knee_hz: where nine tenths of what the sweep takes away are gone, or None where the curve has no such place.
     """
 
     corners_hz: Floats
     rms_m: Floats
     knee_hz: float | None
+
+    @property
+    def at_knee_m(self) -> Floats | None:
+        """(K,) what remains at the knee."""
+        return None if self.knee_hz is None else read_only(self.rms_m[self.corners_hz == self.knee_hz][0])
+
+    @property
+    def beyond_knee_m(self) -> Floats | None:
+        """(K,) the least that a corner above the knee leaves, which may be far less on one axis."""
+        return None if self.knee_hz is None else read_only(self.rms_m[self.corners_hz >= self.knee_hz].min(axis=0))
 
 
 def amplitude_spectrum(values: ArrayLike, time_s: ArrayLike, interval_s: tuple[float, float] | None = None) -> Spectrum:

@@ -217,6 +217,7 @@ def _gps_table(gps: GpsComparison) -> str:
             _cm(row["gps_m"]),
             _cm(row["error_m"]),
             "–" if row["error_percent"] is None else f"{row['error_percent']:.1f}",
+            *([_cm(row["video_at_gps_m"]), _cm(row["error_at_gps_m"])] if gps.is_coarse else []),
         ]
         for row in gps.table()
     ]
@@ -224,9 +225,11 @@ def _gps_table(gps: GpsComparison) -> str:
     rms_x, rms_y = gps.rms_m
     text = (
         f"RMS difference {1000 * rms_x:.2f} mm in x and {1000 * rms_y:.2f} mm in y over {len(gps.time_s)} samples; "
-        f"GPS time {lag} is video time. {gps.message}"
+        f"GPS time {lag} is video time. {gps.spacing} {gps.message}"
     )
     header = ["", "video, cm", "GPS, cm", "error, cm", "error, %"]
+    if gps.is_coarse:
+        header += ["video at the GPS instant, cm", "error there, cm"]
     return f"<h4>Comparison with GPS</h4><p>{escape(text.strip())}</p>{_table(header, rows)}"
 
 

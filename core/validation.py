@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,8 @@ _RIVAL = 1.2
 _BRIDGED_FRAMES = 3.5
 # Samples a record may lack: about six days at 10 Hz. Laid out evenly they take a gigabyte when they are correlated.
 _MOST_MISSING = 5_000_000
+# GPS samples farther apart than this many frames straddle peaks that the video sees.
+_COARSE_FRAMES = 1.5
 
 
 @dataclass(frozen=True)
@@ -51,10 +53,15 @@ class GpsRecord:
 
 @dataclass(frozen=True)
 class ComparisonRow:
-    """One figure of Table 2: the same quantity from the video and from GPS, metres."""
+    """One figure of Table 2: the same quantity from the video and from GPS, metres.
+
+    `video_at_gps_m` is the video at the instant of the GPS value, for a peak: GPS takes fewer samples than the video,
+    its largest one lies beside the peak, and so the two peaks differ even where the records agree.
+    """
 
     video_m: float
     gps_m: float
+    video_at_gps_m: float | None = None
 
     @property
     def error_m(self) -> float:
@@ -65,6 +72,11 @@ class ComparisonRow:
     def error_percent(self) -> float | None:
         """Absolute error in percent of the GPS value; None where that is zero."""
         return 100 * abs(self.error_m / self.gps_m) if self.gps_m else None
+
+    @property
+    def error_at_gps_m(self) -> float | None:
+        """Video less GPS at the instant of the GPS value."""
+        return None if self.video_at_gps_m is None else self.video_at_gps_m - self.gps_m
 
 
 @dataclass(frozen=True)
@@ -81,6 +93,7 @@ class GpsComparison:
         video_m: (N, 2) video at the same times, NaN where not measured.
         error_m: (N, 2) video less GPS.
         rms_m: (2,) of the error.
+        sample_step_s, frame_step_s: how far apart the samples of GPS and the frames of the video lie, the median.
         peak_positive, peak_negative, residual: per axis x, y; None where not measured or no interval is given.
     """
 
@@ -93,9 +106,24 @@ class GpsComparison:
     video_m: Floats
     error_m: Floats
     rms_m: Floats
+    sample_step_s: float
+    frame_step_s: float
     peak_positive: tuple[ComparisonRow | None, ComparisonRow | None]
     peak_negative: tuple[ComparisonRow | None, ComparisonRow | None]
     residual: tuple[ComparisonRow | None, ComparisonRow | None]
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether GPS samples lie so much farther apart than frames that a peak falls between them."""
+        return self.sample_step_s > _COARSE_FRAMES * self.frame_step_s
+
+    @property
+    def spacing(self) -> str:
+        """Say how far apart the samples lie, and what that does to peaks."""
+        lie = f"GPS samples lie {self.sample_step_s:.3g} s apart, frames {self.frame_step_s:.3g} s"
+        if not self.is_coarse:
+            return f"{lie}."
+        return f"{lie}: GPS misses the top of a quick peak, so peaks are also compared at the instants of the GPS ones."
 
     def table(self) -> list[dict[str, Any]]:
         """Return the rows of Table 2 that could be told, per quantity and axis."""
@@ -107,6 +135,8 @@ class GpsComparison:
                 "gps_m": row.gps_m,
                 "error_m": row.error_m,
                 "error_percent": row.error_percent,
+                "video_at_gps_m": row.video_at_gps_m,
+                "error_at_gps_m": row.error_at_gps_m,
             }
             for quantity in ("peak_positive", "peak_negative", "residual")
             for axis, row in zip("xy", getattr(self, quantity), strict=True)
@@ -121,6 +151,8 @@ class GpsComparison:
             "correlation": self.correlation,
             "message": self.message,
             "samples": len(self.time_s),
+            "sample_step_s": self.sample_step_s,
+            "frame_step_s": self.frame_step_s,
             "rms_m": dict(zip("xy", self.rms_m.tolist(), strict=True)),
             **{f"{name}_m": self._rows(name) for name in ("peak_positive", "peak_negative", "residual")},
         }
@@ -130,7 +162,14 @@ class GpsComparison:
         return {
             axis: None
             if row is None
-            else {"video": row.video_m, "gps": row.gps_m, "error": row.error_m, "error_percent": row.error_percent}
+            else {
+                "video": row.video_m,
+                "gps": row.gps_m,
+                "error": row.error_m,
+                "error_percent": row.error_percent,
+                "video_at_gps": row.video_at_gps_m,
+                "error_at_gps": row.error_at_gps_m,
+            }
             for axis, row in zip("xy", rows, strict=True)
         }
 
@@ -145,8 +184,7 @@ def read_gps(path: Path, settings: GpsInput) -> GpsRecord:
         InputError: names the file, and the missing column or the line at fault.
     """
     lines = _content_lines(path)
-    separator = max(",;\t", key=lines[0][1].count)
-    header = [name.strip() for name in next(csv.reader([lines[0][1]], delimiter=separator))]
+    separator, header = _header_of(lines[0][1])
     columns = {key: getattr(settings, key) for key in ("time", "x", "y")}
     for key, name in columns.items():
         if name not in header:
@@ -187,6 +225,21 @@ def _require_one_stretch(path: Path, time_s: Floats, lines: list[tuple[int, str]
         f"{time_s[widest]:g} s, while most are {usual_s:g} s apart; correct the times, or keep only the stretch of "
         "this video."
     )
+
+
+def gps_columns(path: Path) -> list[str]:
+    """Return the names of a GPS record's columns, to choose time and place from.
+
+    Raises:
+        InputError: the file cannot be read as text, or is empty.
+    """
+    return _header_of(_content_lines(path)[0][1])[1]
+
+
+def _header_of(line: str) -> tuple[str, list[str]]:
+    """Return what separates the columns, and their names."""
+    separator = max(",;\t", key=line.count)
+    return separator, [name.strip() for name in next(csv.reader([line], delimiter=separator))]
 
 
 def _content_lines(path: Path) -> list[tuple[int, str]]:
@@ -279,8 +332,10 @@ def compare_with_gps(
         video_m=read_only(video_m),
         error_m=read_only(error_m),
         rms_m=read_only(np.sqrt(np.nanmean(error_m**2, axis=0))),
-        peak_positive=_peak_rows(times, moved, sample_s, sample_m, intervals, sign=1),
-        peak_negative=_peak_rows(times, moved, sample_s, sample_m, intervals, sign=-1),
+        sample_step_s=float(np.median(np.diff(gps.time_s))),
+        frame_step_s=float(np.median(np.diff(times))),
+        peak_positive=_peak_rows(times, moved, sample_s, sample_m, video_m, intervals, sign=1),
+        peak_negative=_peak_rows(times, moved, sample_s, sample_m, video_m, intervals, sign=-1),
         residual=_residual_rows(times, moved, sample_s, sample_m, intervals),
     )
 
@@ -446,15 +501,32 @@ Rows = tuple[ComparisonRow | None, ComparisonRow | None]
 
 
 def _peak_rows(
-    times: Floats, moved: Floats, sample_s: Floats, sample_m: Floats, intervals: Intervals, *, sign: int
+    times: Floats,
+    moved: Floats,
+    sample_s: Floats,
+    sample_m: Floats,
+    video_m: Floats,
+    intervals: Intervals,
+    *,
+    sign: int,
 ) -> Rows:
-    """Return the extremes within the event, each record at its own rate as in the paper."""
+    """Return the extremes within the event, each record at its own rate as in the paper, and the video at GPS's."""
     window = intervals.event or (float(sample_s[0]), float(sample_s[-1]))
 
     def extreme(values: Floats) -> float:
         return sign * float(np.nanmax(sign * values))
 
-    return _rows(moved[within(times, window)], sample_m[within(sample_s, window)], extreme)
+    sampled = within(sample_s, window)
+    x, y = _rows(moved[within(times, window)], sample_m[sampled], extreme)
+    return _at_gps(x, sample_m[sampled, 0], video_m[sampled, 0]), _at_gps(y, sample_m[sampled, 1], video_m[sampled, 1])
+
+
+def _at_gps(row: ComparisonRow | None, gps_m: Floats, video_m: Floats) -> ComparisonRow | None:
+    """Return a row with what the video says at the sample that gave the GPS value, where it was measured there."""
+    if row is None:
+        return None
+    then_m = float(video_m[np.flatnonzero(gps_m == row.gps_m)[0]])
+    return row if math.isnan(then_m) else replace(row, video_at_gps_m=then_m)
 
 
 def _residual_rows(times: Floats, moved: Floats, sample_s: Floats, sample_m: Floats, intervals: Intervals) -> Rows:

@@ -67,7 +67,16 @@ def sweep(
     """Return what each corner frequency would leave of the uncorrected displacement in an interval of rest."""
     history, raw = _raw(here, folder, target, point)
     found = corner_sweep(raw, history.time_s, (start, end), order=order)
-    return {"corners_hz": plain(found.corners_hz), "rms_m": _axes(found.rms_m), "knee_hz": plain(found.knee_hz)}
+    knee = None
+    if found.at_knee_m is not None and found.beyond_knee_m is not None:
+        (dx, dy), (least_dx, least_dy) = plain(found.at_knee_m), plain(found.beyond_knee_m)
+        knee = {"rms_m": {"dx": dx, "dy": dy}, "least_m": {"dx": least_dx, "dy": least_dy}}
+    return {
+        "corners_hz": plain(found.corners_hz),
+        "rms_m": _axes(found.rms_m),
+        "knee_hz": plain(found.knee_hz),
+        "knee": knee,
+    }
 
 
 @router.get("/drift/spectrum")
@@ -135,6 +144,8 @@ def validation(
         "correlation": plain(compared.correlation),
         "rms_m": {"x": plain(compared.rms_m[0]), "y": plain(compared.rms_m[1])},
         "table": plain(compared.table()),
+        "is_coarse": compared.is_coarse,
+        "spacing": compared.spacing,
         "message": message,
     }
 

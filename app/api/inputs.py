@@ -17,6 +17,7 @@ from app.calibrations import REPORT_FILE, board_of
 from app.context import Context, Folder, Here, tell_saved
 from app.errors import ApiError, Invalid, Missing
 from app.frames import fingerprint
+from app.intake import require_usable
 from app.jobs import Finish
 from app.places import SUFFIXES_OF_CLOUD_TABLES, kind_of
 from app.store import (
@@ -34,7 +35,7 @@ from core.errors import InputError
 from core.lens import read_lens, require_image_size
 from core.project import Project
 from core.storage import File
-from core.validation import read_gps
+from core.validation import gps_columns, read_gps
 from core.video import frame_index
 
 router = APIRouter(prefix="/api")
@@ -60,8 +61,17 @@ def browse(here: Here, dir: str | None = None, kind: str | None = None) -> dict[
         "dir": str(folder),
         "parent": str(parent) if parent else None,
         "roots": [str(root) for root in here.places.roots],
+        "home": str(Path.home()),
+        "workspace": str(here.workspace.folder),
         "entries": listed,
     }
+
+
+@router.get("/browse/which")
+def which(path: str, here: Here) -> dict[str, Any]:
+    """Return the file at a path that was typed, or null where it is a folder."""
+    place = here.places.allowed(path)
+    return {"file": None if place.is_dir() else str(here.places.file(path))}
 
 
 def _entry(entry: os.DirEntry[str]) -> dict[str, Any] | None:
@@ -83,7 +93,10 @@ def _wanted(entry: dict[str, Any], kind: str | None) -> bool:
 
 @router.put("/projects/{project_id}/upload/{kind}")
 async def upload(kind: UploadKind, filename: str, request: Request, folder: Folder, here: Here) -> dict[str, Any]:
-    """Take in a file as the raw body; a checkerboard picture is kept beside the inputs, all others become the input."""
+    """Take in a file as the raw body; a checkerboard picture is kept beside the inputs, all others become the input.
+
+    What cannot be used as that input is refused, and the file given before stays.
+    """
     name = plain_name(filename)
     if kind == "checkerboard" and kind_of(Path(name)) != "image":
         raise Invalid(f"{name}: is no picture; send JPEG, PNG or TIFF files of the checkerboard.", path="filename")
@@ -98,6 +111,7 @@ def _take_in(here: Context, folder: ProjectFolder, kind: UploadKind, part: Path,
             (folder.folder / CHECKERBOARD_FOLDER).mkdir(exist_ok=True)
             os.replace(part, folder.folder / CHECKERBOARD_FOLDER / name)
             return {"file": f"{CHECKERBOARD_FOLDER}/{name}", "revision": folder.load().head.revision}
+        require_usable(kind, part, name)
         saved = folder.take_in(kind, part, name)
     finally:
         part.unlink(missing_ok=True)
@@ -121,16 +135,19 @@ def inputs(folder: Folder, here: Here, again: bool = False) -> dict[str, Any]:
 
 
 def _understood(here: Context, folder: ProjectFolder, project: Project, kind: str) -> dict[str, Any] | None:
-    named = stored_inputs(project.inputs)[kind]
+    named = folder.named_input(kind, project)
     if named is None:
         return None
+    found: dict[str, Any] = {}
     readers: dict[str, Callable[..., dict[str, Any]]] = {"video": _video, "cloud": _cloud, "lens": _lens, "gps": _gps}
     try:
         file = folder.require_video(project) if kind == "video" else folder.require_input(kind, project)
-        facts = {"file": named, "path": str(file), "size": fingerprint(file)[1]}
+        if kind == "gps":
+            found["columns_found"] = gps_columns(Path(str(file)))
+        facts = {"file": named, "path": str(file), "size": fingerprint(file)[1], **found}
         return facts | readers[kind](here, folder, project, file)
     except (InputError, ApiError) as error:
-        return {"file": named, "error": {"message": problem_of(error)}}
+        return {"file": named, "error": {"message": problem_of(error)}, **found}
 
 
 def _video(here: Context, folder: ProjectFolder, project: Project, video: File) -> dict[str, Any]:

@@ -27,6 +27,8 @@ router = APIRouter(prefix="/api/projects/{project_id}")
 
 _PIXELS = 8_000_000
 Pixels = Annotated[int, Query(ge=10_000, le=60_000_000)]
+# What lies outside the frame, as the page's own surround of pictures.
+Outside = Annotated[str, Query(pattern="^[0-9a-fA-F]{6}$")]
 
 
 @router.get("/orthoimage")
@@ -82,7 +84,7 @@ def rectified(folder: Folder, here: Here, pixels: Pixels = _PIXELS) -> dict[str,
 
 
 @router.get("/rectified.jpg")
-def rectified_picture(folder: Folder, here: Here, pixels: Pixels = _PIXELS) -> Response:
+def rectified_picture(folder: Folder, here: Here, pixels: Pixels = _PIXELS, outside: Outside = "000000") -> Response:
     """Return the reference frame laid on the ground, on the raster of the orthoimage where there is one."""
     project = folder.load().project
     try:
@@ -91,7 +93,7 @@ def rectified_picture(folder: Folder, here: Here, pixels: Pixels = _PIXELS) -> R
         raise NotYet(str(error), path="correspondences") from None
     grid = coarser(plan_grid(folder, project, fit), pixels)
     frame = here.frames.frame(folder.require_video(project), project.reference_frame)
-    return _cacheable(_rectified(_Rectified(frame, fit, grid)), "image/jpeg")
+    return _cacheable(_rectified(_Rectified(frame, fit, grid), outside), "image/jpeg")
 
 
 class _Rectified:
@@ -109,8 +111,9 @@ class _Rectified:
 
 
 @lru_cache(maxsize=4)
-def _rectified(wanted: _Rectified) -> bytes:
-    picture, _ = rectify_frame(wanted.frame, wanted.fit.lens, H_plan_und(wanted.fit), wanted.grid)
+def _rectified(wanted: _Rectified, outside: str) -> bytes:
+    picture, beyond = rectify_frame(wanted.frame, wanted.fit.lens, H_plan_und(wanted.fit), wanted.grid)
+    picture[beyond] = list(bytes.fromhex(outside))
     return jpeg_of(picture)
 
 

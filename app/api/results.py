@@ -15,7 +15,7 @@ from app.answers import points
 from app.api.projects import Body
 from app.context import Context, Folder, Here
 from app.errors import ApiError, Missing, NotYet
-from app.growing import rows_of
+from app.growing import LEAST_FRAMES, rows_of
 from app.jobs import Finish, Job
 from app.places import Places
 from app.store import CACHE_FOLDER, ProjectFolder
@@ -96,6 +96,7 @@ def track_state(folder: Folder, here: Here) -> dict[str, Any]:
         "frames_done": state.frames_done,
         "frames_total": state.frames_total,
         "message": message,
+        "first_values_after": LEAST_FRAMES,
         "preview": here.growing.rows(folder.id) if running else _rows(here, folder, project),
     }
 

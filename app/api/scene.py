@@ -25,12 +25,14 @@ class Wanted(Body):
     points: Annotated[int, Field(ge=1000, le=MAX_POINTS)] = DEFAULT_POINTS
     colour: Literal["rgb", "intensity", "height"] = "rgb"
     show: dict[Part, bool] = Field(default_factory=dict)
+    take: bool = False
 
 
 @router.post("/scene")
 def scene(folder: Folder, here: Here, wanted: Wanted | None = None) -> dict[str, Any]:
-    """Show a project in the scene, at a frame of the video."""
+    """Show a project in the scene, at a frame of the video; `take` it where another project has it."""
     view = wanted or Wanted()
+    before = here.scene.project
     shown = show(
         here,
         folder,
@@ -41,6 +43,11 @@ def scene(folder: Folder, here: Here, wanted: Wanted | None = None) -> dict[str,
             colour=view.colour,
             show={str(part): visible for part, visible in view.show.items()},
         ),
+        take=view.take,
     )
-    here.hub.publish(folder.id, "scene", {"frame": view.frame})
+    owner = shown["owner"]
+    if before is not None and before != owner:
+        here.hub.publish(before, "scene", {"owner": owner})
+    if owner == folder.id:
+        here.hub.publish(folder.id, "scene", {"owner": owner, "frame": view.frame})
     return shown

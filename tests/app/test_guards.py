@@ -79,9 +79,13 @@ def test_the_walls_of_browsing(client: TestClient, workspace: Path, tmp_path: Pa
     here = client.get("/api/browse").json()
     assert here["dir"] == str(workspace)
     assert [entry["name"] for entry in here["entries"]] == ["leads out", "small"]
+    video = workspace / "small" / "video.mp4"
+    assert client.get("/api/browse/which", params={"path": str(video)}).json() == {"file": str(video)}
+    assert client.get("/api/browse/which", params={"path": str(workspace)}).json() == {"file": None}
     inside = client.get("/api/browse", params={"dir": str(workspace / "small"), "kind": "video"}).json()
     assert [(entry["name"], entry["kind"]) for entry in inside["entries"]] == [("video.mp4", "video")]
     assert inside["parent"] == str(workspace)
     for outside in (tmp_path, workspace / "..", workspace / "leads out", Path("/etc"), Path("relative")):
         assert client.get("/api/browse", params={"dir": str(outside)}).status_code == 403, outside
+        assert client.get("/api/browse/which", params={"path": str(outside)}).status_code == 403, outside
     assert client.get("/api/browse", params={"dir": str(workspace / "none")}).status_code == 404

@@ -77,7 +77,8 @@ def test_a_gps_record_keeps_the_names_of_its_columns(client: TestClient, workspa
 
 @pytest.mark.parametrize("name", ["../../evil.yaml", "a/b/evil.yaml", "..\\..\\evil.yaml", "C:\\evil.yaml"])
 def test_a_name_that_leads_elsewhere_stays_in_the_project(client: TestClient, workspace: Path, name: str) -> None:
-    assert send(client, "lens", name, b"x").json()["file"] == "evil.yaml"
+    lens = (workspace / "small" / "lens.yaml").read_bytes()
+    assert send(client, "lens", name, lens).json()["file"] == "evil.yaml"
     assert (workspace / "small" / "evil.yaml").is_file()
 
 
@@ -94,6 +95,44 @@ def test_a_name_the_project_itself_uses_is_refused(client: TestClient, workspace
 def test_an_empty_file_is_refused(client: TestClient, workspace: Path) -> None:
     assert send(client, "lens", "empty.yaml", b"").status_code == 422
     assert not (workspace / "small" / "empty.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "sent"),
+    [
+        ("video", "video.mp4", "gps.csv"),
+        ("video", "again.mp4", "lens.yaml"),
+        ("lens", "lens.yaml", "gps.csv"),
+        ("gps", "gps.csv", "video.mp4"),
+        ("gps", "again.csv", "lens.yaml"),
+        ("cloud", "site.laz", "gps.csv"),
+        ("cloud", "site.csv", "lens.yaml"),
+        ("cloud", "site.mp4", "video.mp4"),
+    ],
+)
+def test_a_file_that_is_something_else_is_refused_and_the_one_before_stays(
+    client: TestClient, workspace: Path, kind: str, name: str, sent: str
+) -> None:
+    def files() -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in (workspace / "small").iterdir() if "sqlite" not in path.name}
+
+    before, inputs = files(), client.get(SMALL).json()["project"]["inputs"]
+    answer = send(client, kind, name, before[sent])
+    assert (answer.status_code, answer.json()["error"]["path"]) == (422, f"inputs.{kind}")
+    assert answer.json()["error"]["message"].startswith(f"{name}: ")
+    assert files() == before
+    assert client.get(SMALL).json()["project"]["inputs"] == inputs
+
+
+def test_a_file_of_this_computer_that_is_something_else_is_refused_too(client: TestClient, workspace: Path) -> None:
+    state = client.get(SMALL).json()
+    project = state["project"] | {"inputs": state["project"]["inputs"] | {"video": "gps.csv"}}
+    answer = client.put(SMALL, json={"project": project, "revision": state["revision"], "label": "Choose video"})
+    assert (answer.status_code, answer.json()["error"]["path"]) == (422, "inputs.video")
+    assert client.get(SMALL).json()["revision"] == state["revision"]
+    new = {"name": "wrong", "video": str(workspace / "small" / "gps.csv")}
+    assert client.post("/api/projects", json=new).status_code == 422
+    assert not (workspace / "wrong").exists()
 
 
 @pytest.fixture

@@ -52,6 +52,43 @@ def test_a_project_is_listed_with_the_state_of_its_eight_steps(client: TestClien
     }
 
 
+def test_the_inputs_step_is_done_only_when_every_input_can_be_read(client: TestClient, workspace: Path) -> None:
+    def inputs() -> tuple[str, str]:
+        step = get(client)["steps"]["inputs"]
+        return step["status"], step["message"]
+
+    assert inputs()[0] == "done"
+    for name, content, said in (
+        ("gps.csv", "time_s,east_m\n0,0\n", "gps.csv: has no column"),
+        ("lens.yaml", "%YAML:1.0\nimage_width: 4\n", "lens.yaml: "),
+        ("video.mp4", "no video", "video.mp4: "),
+    ):
+        (workspace / "small" / name).write_text(content)
+        status, message = inputs()
+        assert (status, message[: len(said)]) == ("error", said)
+
+
+def test_a_project_made_without_a_video_claims_no_file(client: TestClient, workspace: Path) -> None:
+    made = client.post("/api/projects", json={"name": "empty"}).json()["id"]
+    pages = f"/api/projects/{made}"
+    assert client.get(f"{pages}/inputs").json()["video"] is None
+    told = [*client.get(pages).json()["problems"], client.get(f"{pages}/frames/0.jpg").json()["error"]["message"]]
+    assert [words for words in told if "video.mp4" in words] == []
+    assert "inputs.video: none is given yet; choose the video in the inputs." in told
+    (workspace / made / "video.mp4").write_bytes((workspace / "small" / "video.mp4").read_bytes())
+    assert client.get(f"{pages}/inputs").json()["video"]["file"] == "video.mp4"
+
+
+def test_a_step_that_was_not_done_is_not_called_done(client: TestClient) -> None:
+    made = client.post("/api/projects", json={"name": "empty"}).json()["id"]
+    steps = client.get(f"/api/projects/{made}").json()["steps"]
+    assert {step["status"] for step in steps.values()} == {"todo"}
+    state = get(client)
+    typed = state["project"] | {"inputs": state["project"]["inputs"] | {"cloud": None}}
+    client.put(SMALL, json={"project": typed, "revision": state["revision"]})
+    assert get(client)["steps"]["orthoimage"]["status"] == "unneeded"
+
+
 def test_an_edit_is_on_the_disk_and_has_a_new_revision(client: TestClient, workspace: Path) -> None:
     before = get(client)
     after = rename(client, "other", before["revision"]).json()
@@ -210,7 +247,8 @@ def test_a_copy_is_a_project_of_its_own(client: TestClient, workspace: Path) -> 
     rename(client, "changed", get(client)["revision"])
     assert client.get(f"/api/projects/{copy}").json()["project"]["name"] == "copy"
     assert (workspace / copy / "video.mp4").read_bytes() == (workspace / "small" / "video.mp4").read_bytes()
-    client.put(f"{SMALL}/upload/lens?filename=lens.yaml", content=b"other")
+    other = (workspace / "small" / "lens.yaml").read_bytes() + b"\n"
+    assert client.put(f"{SMALL}/upload/lens?filename=lens.yaml", content=other).status_code == 200
     assert (workspace / copy / "lens.yaml").read_bytes() != b"other"
 
 

@@ -20,7 +20,10 @@ from websockets.exceptions import InvalidStatus
 from app import scene3d
 from app.context import Context
 from app.scene3d import CLIENT_FILE, TOKEN_HEADER, CloudView, Scene3D, line_colours
+from app.scenes import _ground
+from app.sites import Site
 from core import figures
+from core.cloud import GroundPlane, make_cloud
 
 HOST = {"Host": "127.0.0.1:8000"}
 ORIGIN = HOST | {"Origin": "http://127.0.0.1:8000"}
@@ -192,3 +195,45 @@ def test_a_click_in_the_scene_tells_the_tabs_the_height(
     assert event == "pick"
     assert data["xyz_m"][:2] == pytest.approx([2.0, 3.0], abs=0.2)
     assert data["height_m"] == pytest.approx(0.0, abs=0.03)
+
+
+def test_one_scene_is_handed_from_project_to_project_and_never_holds_two(
+    client: TestClient, context: Context, finished: Callable[[dict[str, Any]], dict[str, Any]]
+) -> None:
+    client.post("/api/projects", json={"name": "empty"})
+    context.sites.begin(context.workspace.open("small"), context.workspace.open("small").load().project)
+    job = context.jobs.latest("small", "cloud")
+    assert job is not None
+    finished(job.as_json())
+    told: list[Any] = []
+    context.hub.publish = lambda project, event, data: told.append((project, event, data))  # type: ignore[method-assign]
+
+    def show(project: str, **more: Any) -> Any:
+        return client.post(f"/api/projects/{project}/scene", json={"points": 1000, **more}).json()
+
+    assert show("small", take=True)["owner"] == "small"
+    left = show("empty")
+    assert (left["ready"], left["owner"]) == (False, "small")
+    assert "cloud" in context.scene._shown.nodes
+    taken = show("empty", take=True)
+    assert (taken["ready"], taken["owner"]) == (False, "empty")
+    assert "point cloud" in taken["message"]
+    assert context.scene._shown.nodes == {}
+    assert context.scene._pick is None
+    assert ("small", "scene", {"owner": "empty"}) in told
+    assert (show("small")["ready"], show("small")["points_shown"]) == (False, 0)
+    assert show("small", take=True)["ready"]
+
+
+def test_a_ground_at_zero_has_no_sign() -> None:
+    plane = GroundPlane(
+        at_m=(0.0, 0.0, -0.001),
+        slope=(0.0, 0.0),
+        elevation_std_m=0.0,
+        elevation_p5_m=0.0,
+        elevation_p95_m=0.0,
+        ground_points=10,
+        area_m2=1.0,
+    )
+    cloud = make_cloud(np.zeros((4, 3)))
+    assert "z = 0.00 m" in _ground(Site("key", cloud, plane)).label

@@ -159,6 +159,27 @@ def test_the_scene_follows_the_player_and_exaggerates_the_motion(browser, pages)
         assert np.hypot(*(roof_line(page) - at_rest)) < FAR_PX / 4
 
 
+def test_the_scene_of_one_project_is_not_shown_as_anothers(browser, pages):
+    address = pages.split("/p/")[0]
+    with watched(browser, pages) as first, watched(browser, pages) as second:
+        first.goto(f"{pages}/orthoimage")
+        scene = first.locator("iframe.scene-frame")
+        expect(first.locator("#scene-settings")).to_contain_text("drawn; the engine uses all", timeout=60_000)
+        expect(scene).to_be_visible()
+        inside = first.frame_locator("iframe.scene-frame")
+        expect(inside.locator("[data-dock-tab=viser-control-panel]")).to_be_hidden()
+        made = second.request.post(
+            f"{address}/api/projects", data={"name": "empty"}, headers={"X-Rooftrack": "1", "Origin": address}
+        ).json()
+        second.goto(f"{address}/p/{made['id']}/orthoimage")
+        expect(second.locator("#scene .pane-note")).to_contain_text("no point cloud")
+        expect(second.locator("iframe.scene-frame")).to_be_hidden()
+        expect(scene).to_be_hidden()
+        first.get_by_role("button", name="Show this project here").click()
+        expect(scene).to_be_visible()
+        expect(second.locator("#scene .pane-note")).to_contain_text("“sample” in another window")
+
+
 SCRUB = """(frame) => {
     const scrubber = document.querySelector(".player-scrubber");
     scrubber.value = String(frame);

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from urllib.error import HTTPError
 
 import cv2
 import numpy as np
@@ -431,7 +432,7 @@ def test_the_columns_of_another_gps_file_are_told(browser, project):
         card.get_by_role("button", name="Columns…").click()
         dialog = page.get_by_role("dialog")
         for label, column in (("Time, s", "seconds"), ("East, m", "E"), ("North, m", "N")):
-            dialog.get_by_label(label).fill(column)
+            dialog.get_by_label(label).select_option(column)
         dialog.get_by_label("Antenna east").fill("0.5")
         dialog.get_by_label("Antenna north").fill("-1.25")
         dialog.get_by_role("button", name="Save").click()
@@ -463,6 +464,136 @@ def test_a_pair_is_placed_by_the_keyboard_alone(browser, project):
     assert read_project(folder).correspondences[20].ground_m == (1.5, -2.25)
 
 
+TOLD = """async (message) => {
+    const { words, step } = (await import("/static/js/lib/problems.js")).told(message);
+    return [words, step];
+}"""
+
+
+def test_the_engines_sentences_are_told_in_words_of_the_pages(browser, project):
+    _, pages = project
+    sentences = {
+        "/a folder/p/project.json: inputs.lens: missing, but needed; calibrate with rooftrack lens.": (
+            "Lens: missing, but needed; calibrate it.",
+            "inputs",
+        ),
+        "project.json: targets.roof.lines.T1 holds no line; draw the band along a strip.": (
+            "Band T1 holds no line; draw the band along a strip.",
+            "regions",
+        ),
+        "project.json: targets[0].lines.L1.from_m: [1, 2] lies outside orthoimage.extent_m; move it.": (
+            "Band L1: [1, 2] lies outside the orthoimage's extent; move it.",
+            "regions",
+        ),
+        "project.json: correspondences: id 3: frame_px [1, 2] is outside the 3 x 4 frame; click it again.": (
+            "Correspondences: pair 3: [1, 2] is outside the 3 x 4 frame; click it again.",
+            "correspondences",
+        ),
+        "/w/p/gps.csv: is empty; export it again.": ("gps.csv: is empty; export it again.", None),
+        "Measured 20 frames/s and 3 m/s.": ("Measured 20 frames/s and 3 m/s.", None),
+        "/etc/x: lies outside the folders Rooftrack may read (/home/x).": (
+            "/etc/x: lies outside the folders Rooftrack may read (/home/x).",
+            None,
+        ),
+    }
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/inputs")
+        for sentence, (words, step) in sentences.items():
+            assert page.evaluate(TOLD, sentence) == [words, step]
+
+
+def test_a_problem_leads_to_the_step_where_it_is_put_right(browser, project):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    document["targets"] = []
+    (folder / "project.json").write_text(json.dumps(document))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/track")
+        problem = page.locator(".note.bad")
+        expect(problem).to_contain_text("Targets: none")
+        expect(problem).not_to_contain_text("project.json")
+        problem.get_by_role("link", name="Regions").click()
+        page.wait_for_url("**/regions")
+
+
+def test_a_narrow_window_reads_downwards(browser, project):
+    _, pages = project
+    with watched(browser, pages, viewport={"width": 800, "height": 900}) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        stage, side = page.locator(".stage").bounding_box(), page.locator(".side").bounding_box()
+        assert (stage["width"], side["x"], side["width"]) == (800, 0, 800)
+        assert side["y"] >= stage["y"] + stage["height"]
+        expect(page.locator(".brand-name")).to_be_hidden()
+        assert page.evaluate("document.documentElement.scrollWidth") == 800
+        page.set_viewport_size({"width": 1920, "height": 1080})
+        page.goto(f"{pages}/inputs")
+        assert page.locator(".card-grid").bounding_box()["width"] > 1400
+
+
+def test_regions_are_numbered_and_surrounded_alike(browser, project, truth):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions")
+        ready(page, "Orthorectified")
+        numbers = [page.locator(f"[data-id='moving:number:{i}'] text") for i in range(len(truth.moving_regions_px))]
+        assert [number.text_content() for number in numbers] == [str(i + 1) for i in range(len(numbers))]
+        surround = page.evaluate("getComputedStyle(document.querySelector('.pane')).backgroundColor")
+    levels = [int(level) for level in re.findall(r"\d+", surround)]
+    outside = "".join(f"{level:02x}" for level in levels)
+    picture = cv2.imdecode(np.frombuffer(ask_bytes(pages, f"rectified.jpg?outside={outside}"), np.uint8), 1)
+    assert picture[0, 0, ::-1] == pytest.approx(levels, abs=4)  # JPEG
+    with pytest.raises(HTTPError, match="422"):
+        ask_bytes(pages, "rectified.jpg?outside=red")
+
+
+def test_a_file_is_chosen_by_typing_its_path(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/inputs")
+        lens = page.locator(".input-card[data-kind=lens]")
+        (folder / "again.yaml").write_text((SAMPLE / "lens.yaml").read_text())
+        lens.get_by_role("button", name="Choose on this computer").click()
+        path = page.get_by_label("Path of a file or folder")
+        expect(path).to_have_value(re.compile("^/"))
+        path.fill(str(folder / "none.yaml"))
+        path.press("Enter")
+        expect(page.get_by_role("dialog")).to_contain_text("no such file")
+        path.fill(str(folder))
+        path.press("Enter")
+        expect(page.get_by_role("option", name="again.yaml")).to_be_visible()
+        path.fill(f'"{folder / "again.yaml"}"')
+        path.press("Enter")
+        expect(page.get_by_role("dialog")).to_have_count(0)
+        saved(page)
+        eventually(lambda: read_project(folder).inputs.lens == "again.yaml")
+
+
+def test_what_is_missing_is_named_with_the_way_to_it(browser, project, server):
+    _, pages = project
+    _, address = server
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")  # a video, but no cloud
+        ready(page, "Reference frame")
+        ortho = pane(page, "Orthoimage")
+        expect(ortho.get_by_role("link", name="Choose a point cloud")).to_be_visible()
+        expect(ortho.get_by_role("link", name="Make the orthoimage")).to_have_count(0)
+        ortho.click(position={"x": 60, "y": 300})
+        expect(ortho.locator(".pane-note")).to_have_attribute("data-clicks", "1")
+        expect(page.get_by_text("Nothing was placed.")).to_be_attached()
+        page.goto(f"{pages}/orthoimage")
+        expect(page.get_by_role("button", name="Make the orthoimage")).to_be_disabled()
+        made = page.request.post(
+            f"{address}/api/projects", data={"name": "bare"}, headers={"X-Rooftrack": "1", "Origin": address}
+        ).json()["id"]
+        page.goto(f"{address}/p/{made}/regions")
+        expect(page.get_by_text("Click the corners in the left picture")).to_be_visible()
+        plan = pane(page, "Orthorectified")
+        expect(plan.get_by_role("link", name="Place correspondences")).to_have_count(0)
+        plan.get_by_role("link", name="Inputs").click()
+        page.wait_for_url("**/inputs")
+
+
 def test_inputs_are_sent_taken_back_and_calibrated(browser, project, tmp_path):
     folder, pages = project
     with watched(browser, pages) as page:
@@ -481,7 +612,9 @@ def test_inputs_are_sent_taken_back_and_calibrated(browser, project, tmp_path):
         wrong = tmp_path / "wrong.yaml"
         wrong.write_text("not a lens")
         chooser.value.set_files(wrong)
-        expect(lens.locator(".note.bad")).to_contain_text("wrong.yaml")
+        expect(page.get_by_role("alert")).to_contain_text("wrong.yaml")
+        expect(lens.locator(".badge")).to_have_text("understood")  # the lens before stays
+        assert read_project(folder).inputs.lens == "lens.yaml"
 
         lens.get_by_role("button", name="Calibrate…").click()
         page.get_by_role("button", name="Pictures on this computer…").click()

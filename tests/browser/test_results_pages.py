@@ -61,7 +61,9 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
         page.goto(f"{address}/p/sample/track")
         page.get_by_role("button", name="Start").click()
         page.wait_for_function("() => parseInt(document.querySelector('.figures .value')?.textContent) > 5")
+        expect(page.locator("[data-step=track]")).to_have_attribute("data-status", "running")
         page.get_by_role("button", name="Cancel").click()
+        expect(page.locator("[data-step=track]")).to_have_attribute("data-status", "warn")
         expect(page.get_by_role("button", name="Resume")).to_be_visible()
     with serving(tmp_path, port) as address, watched(browser, address) as page:
         kept = ask(f"{address}/p/sample", "track")["frames_done"]
@@ -81,6 +83,58 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
     resumed, straight = (read_history_csv(folder / "results" / "roof.csv") for folder in (tmp_path / "sample", scene))
     assert resumed.status.tolist() == straight.status.tolist()
     assert np.nanmax(np.abs(resumed.p1_m - straight.p1_m)) < SAME_M  # a lost frame has no value in either
+
+
+def test_a_server_that_is_gone_is_noticed_and_found_again(browser, scene, tmp_path):
+    shutil.copytree(scene, tmp_path / "sample", ignore=shutil.ignore_patterns("results"))
+    port = free_port()
+    with watched(browser, f"http://127.0.0.1:{port}") as page:
+        bar = page.get_by_text("The server does not answer")
+        with serving(tmp_path, port) as address:
+            page.goto(f"{address}/p/sample/track")
+            page.get_by_role("button", name="Start").click()
+            expect(page.get_by_text("The first values appear after 8 frames.")).to_be_visible()
+            page.wait_for_function("() => parseInt(document.querySelector('.figures .value')?.textContent) > 5")
+            expect(bar).to_be_hidden()
+        expect(bar).to_be_visible(timeout=20_000)
+        expect(page.locator("progress.frozen")).to_be_visible()
+        expect(page.get_by_role("button", name="Cancel")).to_be_disabled()
+        with serving(tmp_path, port):
+            expect(bar).to_be_hidden(timeout=20_000)
+            expect(page.get_by_role("link", name="Review the result")).to_be_visible(timeout=240_000)
+
+
+def test_a_method_not_measured_yet_is_a_state_and_no_error(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/track")
+        expect(page.get_by_role("link", name="Review the result")).to_be_visible(timeout=30_000)
+        page.get_by_role("radio", name="Paper").click()
+        expect(page.locator(".note.info")).to_contain_text("Not measured by this method yet")
+        expect(page.get_by_role("button", name="Start", exact=True)).to_be_visible()
+        expect(page.locator(".note.good")).to_have_count(0)
+        expect(page.locator(".plot-stack.faint")).to_be_visible()  # the other method's curve stays in sight
+        eventually(lambda: read_project(folder).method == "paper")
+        page.wait_for_timeout(1000)
+        expect(page.locator(".toast")).to_have_count(0)
+        page.goto(f"{pages}/drift")
+        expect(page.get_by_role("heading", name="Not measured by the paper method yet")).to_be_visible(timeout=30_000)
+
+
+def test_a_failed_measurement_is_told_once_and_leads_to_its_remedy(browser, project):
+    folder, pages = project
+    message = "project.json: targets.roof.lines.T1 holds no line with two edges in the reference frame; draw it again."
+    note = {"kind": "track", "state": "failed", "parameters": {}, "message": message}
+    (folder / "results" / "job.json").write_text(json.dumps(note))
+    document = json.loads((folder / "project.json").read_text())
+    document["targets"][0]["lines"]["T1"]["width_m"] *= 1.5
+    (folder / "project.json").write_text(json.dumps(document))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/track")
+        told = page.get_by_text("Band T1 holds no line")
+        expect(told).to_have_count(1, timeout=30_000)
+        expect(page.locator(".note.bad").get_by_role("link", name="Regions")).to_be_visible()
+        expect(page.locator(".toast")).to_have_count(0)
 
 
 def at_rest(page: Page, frame: int) -> None:

@@ -164,10 +164,26 @@ def test_knee_is_found_at_the_end_of_the_drift(seed: int, limit_hz: float) -> No
     assert sweep.knee_hz == pytest.approx(limit_hz, abs=0.051)
 
 
+def test_what_remains_at_the_knee_is_told_and_what_lies_beyond_it() -> None:
+    time_s = clock(60)
+    noise = np.random.default_rng(9).normal(scale=1e-3, size=(len(time_s), 2))
+    slow = drift_below(0.25, time_s, seed=3)
+    # One axis falls on beyond the knee: the other's drift is a fifth as large, but reaches to 0.4 Hz.
+    moved = np.column_stack([slow, 0.2 * drift_below(0.4, time_s, seed=8)]) + noise
+    sweep = corner_sweep(moved, time_s, (0.0, 30.0))
+    assert sweep.knee_hz is not None
+    place = int(np.searchsorted(sweep.corners_hz, sweep.knee_hz))
+    assert sweep.at_knee_m == pytest.approx(sweep.rms_m[place])
+    assert sweep.beyond_knee_m is not None
+    assert sweep.beyond_knee_m == pytest.approx(sweep.rms_m[place:].min(axis=0))
+    assert sweep.beyond_knee_m[1] < 0.7 * sweep.rms_m[place, 1]
+
+
 def test_no_knee_without_drift_nor_with_drift_beyond_the_sweep() -> None:
     time_s = clock(60)
     noise = np.random.default_rng(7).normal(scale=1e-3, size=(len(time_s), 2))
-    assert corner_sweep(noise, time_s, (0.0, 30.0)).knee_hz is None
+    none = corner_sweep(noise, time_s, (0.0, 30.0))
+    assert (none.knee_hz, none.at_knee_m, none.beyond_knee_m) == (None, None, None)
     fast = 0.05 * np.sin(2 * np.pi * 0.48 * time_s)
     assert corner_sweep(fast, time_s, (0.0, 30.0)).knee_hz is None
 

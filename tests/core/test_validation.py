@@ -110,6 +110,26 @@ def test_rows_are_those_of_table_2() -> None:
     assert comparison.summary()["residual_m"]["x"]["error"] == residual.error_m
 
 
+def test_a_peak_between_two_gps_samples_is_compared_at_the_gps_instant() -> None:
+    time_s, moved = video()
+    # Twice a second, GPS misses the top of shaking at 1.9 Hz by centimetres; the records agree all the same.
+    clock_s = np.arange(-2.8, 36.0, 0.5)
+    record = GpsRecord("gps.csv", clock_s, ORIGIN_M + roof(clock_s))
+    comparison = compare_with_gps(time_s, moved, record, INTERVALS)
+    peak = comparison.peak_positive[0]
+    assert peak is not None
+    assert peak.error_m > 0.02
+    assert peak.error_at_gps_m == pytest.approx(0.0, abs=0.002)
+    assert (comparison.sample_step_s, comparison.frame_step_s) == (pytest.approx(0.5), pytest.approx(1 / 30))
+    assert comparison.is_coarse
+    assert "0.5 s apart, frames 0.0333 s" in comparison.spacing
+    told = comparison.summary()
+    assert told["peak_positive_m"]["x"]["video_at_gps"] == peak.video_at_gps_m
+    assert told["residual_m"]["x"]["video_at_gps"] is None
+    as_quick = GpsRecord("gps.csv", time_s, ORIGIN_M + roof(time_s))
+    assert not compare_with_gps(time_s, moved, as_quick, INTERVALS).is_coarse
+
+
 def test_without_residual_interval_there_is_no_residual_row() -> None:
     time_s, moved = video()
     comparison = compare_with_gps(time_s, moved, gps_with_lag(0.5), Intervals(pre_event=(0.0, 9.0)))

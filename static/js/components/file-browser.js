@@ -8,7 +8,7 @@ import { dialogActions, openDialog } from "./dialog.js";
 
 /**
  * @typedef {{name: string, path: string, is_dir: boolean, size: number | null, kind: string | null}} Entry
- * @typedef {{dir: string, parent: string | null, roots: string[], entries: Entry[]}} Listing
+ * @typedef {{dir: string, parent: string | null, roots: string[], home: string, workspace: string, entries: Entry[]}} Listing
  */
 
 const ICONS = /** @type {Record<string, import("../lib/icons.js").IconName>} */ ({
@@ -80,11 +80,27 @@ class FileBrowser {
     localStorage.setItem(REMEMBERED, listing.dir);
     fill(
       this.#trail,
-      crumbs(listing, (path) => void this.go(path)),
+      crumbs(
+        listing,
+        (path) => void this.go(path),
+        (path) => void this.#take(path),
+      ),
     );
     fill(this.list, listing.entries.map(this.#row, this));
     this.#note.textContent = listing.entries.length === 0 ? "Nothing of this kind here." : "";
     /** @type {HTMLElement | null} */ (this.list.firstElementChild)?.focus();
+  }
+
+  /** A path that was typed or pasted: of a folder to look into, or of the file itself. @param {string} path */
+  async #take(path) {
+    try {
+      const { file } = await get(`browse/which?path=${encodeURIComponent(path)}`);
+      if (file === null) return await this.go(path);
+      this.#chosen = new Set([file]);
+      this.#finish();
+    } catch (error) {
+      this.#note.textContent = sentence(error);
+    }
   }
 
   /** @param {Entry} entry */
@@ -134,8 +150,8 @@ const fileRow = (entry) =>
     h("span", { class: "faint number" }, entry.is_dir ? "" : size(entry.size)),
   );
 
-/** @param {Listing} listing @param {(path: string) => void} go */
-function crumbs(listing, go) {
+/** @param {Listing} listing @param {(path: string) => void} go @param {(path: string) => void} take a path that was typed */
+function crumbs(listing, go, take) {
   const button = (/** @type {string} */ path, /** @type {string} */ name) =>
     h("button", { class: "button quiet small", type: "button", onclick: () => go(path) }, name);
   const up = h(
@@ -149,13 +165,27 @@ function crumbs(listing, go) {
     },
     icon("arrow_left"),
   );
+  const named = /** @type {Record<string, string>} */ ({ [listing.home]: "Home", [listing.workspace]: "Projects" });
   const roots = listing.roots
     .filter((root) => root !== listing.dir)
-    .map((root) => button(root, root.split("/").filter(Boolean).at(-1) ?? root));
+    .map((root) => button(root, named[root] ?? root.split("/").filter(Boolean).at(-1) ?? root));
+  const path = h("input", {
+    class: "input path",
+    type: "text",
+    "aria-label": "Path of a file or folder",
+    title: "Type or paste the path of a file or folder, then Enter",
+    spellcheck: "false",
+    autocomplete: "off",
+    value: listing.dir,
+    onkeydown: (/** @type {KeyboardEvent} */ event) => {
+      if (event.key !== "Enter") return;
+      event.preventDefault();
+      take(path.value.trim().replace(/^["']|["']$/g, ""));
+    },
+  });
   return [
     up,
-    h("span", { class: "path" }, listing.dir),
-    h("span", { class: "spring" }),
+    path,
     ...(roots.length > 0 ? [h("span", { class: "faint small" }, "Go to"), ...roots] : []),
   ];
 }

@@ -3,8 +3,10 @@
 import { fill, find, h, svg } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
 import { bindKeys } from "../lib/keys.js";
+import { told } from "../lib/problems.js";
 import { nextTheme, themeIcon } from "../lib/theme.js";
 import { openHelp } from "./help.js";
+import { isRunning } from "./job-card.js";
 import { toastError } from "./toast.js";
 
 /** @typedef {import("../lib/types.js").StepName} StepName */
@@ -29,6 +31,7 @@ const STATUS_ICONS = /** @type {const} */ ({
   error: "close",
   stale: "stale",
   running: "running",
+  unneeded: "minus",
 });
 const STATUS_WORDS = {
   todo: "to do",
@@ -37,7 +40,12 @@ const STATUS_WORDS = {
   error: "needs attention",
   stale: "out of date",
   running: "running",
+  unneeded: "not needed",
 };
+/** Which step a job works for. @type {Record<string, StepName>} */
+const STEP_OF_JOB = { track: "track", orthoimage: "orthoimage" };
+/** @type {{status: StepStatus, message: string}} */
+const RUNNING = { status: "running", message: "" };
 
 /** Header of a page outside any project. @param {...Node} actions */
 export function projectsHeader(...actions) {
@@ -50,8 +58,8 @@ export function projectsHeader(...actions) {
   bindKeys([helpKey("Projects")]);
 }
 
-/** @param {ProjectStore} store @param {StepName} step */
-export function projectHeader(store, step) {
+/** @param {ProjectStore} store @param {StepName} step @param {import("../lib/events.js").ServerEventStream} events */
+export function projectHeader(store, step, events) {
   const title = STEPS.find((entry) => entry.step === step)?.name ?? "";
   const name = h("span", { class: "project-name" });
   const steps = h("nav", { class: "steps", "aria-label": "Steps" });
@@ -66,18 +74,31 @@ export function projectHeader(store, step) {
     h("div", { class: "header-actions" }, saved, undo, redo, themeButton(), helpButton(title)),
   );
 
+  /** What works now, heard from the server; the project's own state is as old as the last edit. @type {StepName | null} */
+  let working = null;
   const show = () => {
     const { state } = store;
+    const stateOf = (/** @type {StepName} */ name) => (name === working ? RUNNING : state.steps?.[name]);
     name.textContent = store.project.name;
     name.title = store.project.name;
     document.title = `${title} · ${store.project.name} · Rooftrack`;
     fill(
       steps,
-      STEPS.map((entry, i) => stepLink(state.id, entry, i + 1, state.steps?.[entry.step], entry.step === step)),
+      STEPS.map((entry, i) => stepLink(state.id, entry, i + 1, stateOf(entry.step), entry.step === step)),
     );
     setAction(undo, state.can_undo, `Undo${state.undo_label ? `: ${state.undo_label}` : ""} (Ctrl+Z)`);
     setAction(redo, state.can_redo, `Redo${state.redo_label ? `: ${state.redo_label}` : ""} (Ctrl+Shift+Z)`);
   };
+  const hear = (/** @type {import("../lib/types.js").Job | null} */ job) => {
+    if (job !== null && !(job.kind in STEP_OF_JOB)) return;
+    const before = working;
+    working = isRunning(job) ? STEP_OF_JOB[/** @type {import("../lib/types.js").Job} */ (job).kind] : null;
+    if (working === before) return;
+    show();
+    if (working === null) void store.refresh().catch(toastError);
+  };
+  events.on("job", hear);
+  events.on("hello", ({ job }) => hear(job));
   store.on("change", show);
   store.on("saving", (state) => showSaving(saved, state));
   show();
@@ -93,6 +114,19 @@ export function projectHeader(store, step) {
   ]);
 }
 
+/** A bar below the header while the server does not answer. @param {import("../lib/events.js").ServerEventStream} events */
+export function tellConnection(events) {
+  const bar = h(
+    "p",
+    { class: "connection-bar", role: "status", hidden: true },
+    icon("warn", "small"),
+    "The server does not answer – trying again",
+  );
+  find("#header").append(bar);
+  events.on("offline", () => (bar.hidden = false));
+  events.on("online", () => (bar.hidden = true));
+}
+
 /** @param {string} id @param {StepName} step */
 export const stepUrl = (id, step) => `/p/${encodeURIComponent(id)}/${step}`;
 
@@ -104,7 +138,7 @@ export function statusMark(status, number = "") {
 /** @param {string} id @param {{step: StepName, name: string}} entry @param {number} number @param {{status: StepStatus, message: string} | undefined} state @param {boolean} current */
 function stepLink(id, entry, number, state, current) {
   const status = state?.status ?? "todo";
-  const words = `${entry.name}: ${STATUS_WORDS[status]}${state?.message ? `. ${state.message}` : ""}`;
+  const words = `${entry.name}: ${STATUS_WORDS[status]}${state?.message ? `. ${told(state.message).words}` : ""}`;
   return h(
     "a",
     {
@@ -135,7 +169,7 @@ function brand() {
     }),
     svg("circle", { cx: 12, cy: 15, r: 2.2, fill: "#ffd23f" }),
   );
-  return h("a", { class: "brand", href: "/", title: "All projects" }, logo, "Rooftrack");
+  return h("a", { class: "brand", href: "/", title: "All projects" }, logo, h("span", { class: "brand-name" }, "Rooftrack"));
 }
 
 /** @param {"undo" | "redo"} name @param {string} label @param {() => void} run */

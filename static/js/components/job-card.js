@@ -2,6 +2,7 @@
 
 import { fill, h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
+import { told } from "../lib/problems.js";
 import { count, duration, fixed } from "../lib/format.js";
 import { remove } from "../lib/api.js";
 import { toastError } from "./toast.js";
@@ -38,7 +39,7 @@ export function jobCard({ unit = "" } = {}) {
       element.classList.toggle("failed", failed);
       cancel.hidden = !isRunning(job);
       bar.hidden = failed;
-      stage.textContent = failed ? (job.message ?? "Failed") : job.stage || "Starting";
+      stage.textContent = failed ? told(job.message || "Failed").words : job.stage || "Starting";
       numbers.textContent = isRunning(job) ? progressWords(job, unit) : "";
       if (job.total > 0) bar.value = job.done / job.total;
       else bar.removeAttribute("value");

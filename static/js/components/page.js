@@ -20,7 +20,7 @@ import { bindKeys } from "../lib/keys.js";
 import { fill, find, h } from "../lib/dom.js";
 import { ApiError, sentence } from "../lib/api.js";
 import { plural } from "../lib/format.js";
-import { projectHeader, STEPS } from "./header.js";
+import { projectHeader, STEPS, tellConnection } from "./header.js";
 import { toast, toastError } from "./toast.js";
 
 /** @typedef {import("../lib/types.js").StepName} StepName */
@@ -32,7 +32,8 @@ export async function openPage(step) {
   try {
     const store = await ProjectStore.open(id);
     const events = new ServerEventStream(id);
-    projectHeader(store, step);
+    projectHeader(store, step, events);
+    tellConnection(events);
     tellTroubles(store);
     window.addEventListener("beforeunload", (event) => store.hasUnsaved && event.preventDefault());
     events.on("hello", ({ revision }) => store.heardOf(revision));

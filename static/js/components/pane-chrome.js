@@ -3,6 +3,7 @@
 import { fill, h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
 import { fixed } from "../lib/format.js";
+import { announce } from "./toast.js";
 
 /** @typedef {import("./pane.js").Pane} Pane */
 /** @typedef {import("../lib/types.js").Point} Point */
@@ -34,6 +35,14 @@ export function paneChrome(pane, { title, readout }) {
     const zoom = `${fixed(pane.view.scale * 100, pane.view.scale < 0.1 ? 1 : 0)} %`;
     fill(place, ...(pane.cursor === null ? [] : readout(pane.cursor)), h("span", {}, zoom));
   };
+  // A click on a picture that is not there is answered by what stands in its place.
+  pane.on("click", () => {
+    if (pane.image !== null || note.hidden) return;
+    note.getAnimations().forEach((animation) => animation.cancel());
+    note.animate([{ scale: 1 }, { scale: 1.05 }, { scale: 1 }], { duration: 260, easing: "ease-out" });
+    note.dataset.clicks = String(Number(note.dataset.clicks ?? 0) + 1);
+    announce(`Nothing was placed. ${note.firstChild?.textContent ?? ""}`);
+  });
   pane.on("hover", show);
   pane.on("view", show);
   show();

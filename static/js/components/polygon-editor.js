@@ -16,6 +16,7 @@ import { add } from "../lib/coordinates.js";
  * @property {() => Point[][]} polygons  as stored now
  * @property {(label: string, polygons: Point[][], merge: boolean) => void} save
  * @property {() => boolean} accepts  whether a click on empty ground starts or continues a polygon
+ * @property {boolean} [numbered]  each carries its number, as its list does
  * @property {boolean} [single]  a closed polygon takes the place of the one before
  */
 
@@ -65,6 +66,10 @@ export class PolygonEditor extends Emitter {
         points: [...corners, corners[0]],
         grab: true,
       });
+      // At another corner each, since outlines of one building share them.
+      const at = corners[i % corners.length];
+      if (this.options.numbered)
+        shapes.push({ id: `${prefix}:number:${i}`, kind: "polyline", class: look, points: [at], label: `${i + 1}` });
       if (isSelected)
         corners.forEach((corner, j) =>
           shapes.push({

@@ -1,8 +1,9 @@
 // The 3D scene beside the player: camera, frame and roof lines in step with it, motion exaggerated on request.
 
 import { post, projectPath, sentence } from "../lib/api.js";
-import { fill, h } from "../lib/dom.js";
+import { h } from "../lib/dom.js";
 import { pointsShown } from "../lib/graphics.js";
+import { SceneCover, sceneFrame } from "./scene-cover.js";
 
 const LEAST_PAUSE_MS = 80;
 const ASKS_AGAIN_MS = 1000;
@@ -12,10 +13,10 @@ export class SceneView {
   #sending = false;
   #changed = false;
   /** Always sent whole: the server remembers nothing of earlier wishes. */
-  #wish = { frame: 0, exaggeration: 1, points: 0 };
+  #wish = { frame: 0, exaggeration: 1, points: 0, take: true };
 
-  /** @param {HTMLElement} host @param {string} projectId */
-  constructor(host, projectId) {
+  /** @param {HTMLElement} host @param {string} projectId @param {import("../lib/events.js").ServerEventStream} events */
+  constructor(host, projectId, events) {
     this.host = host;
     this.projectId = projectId;
     this.amount = h("output", { class: "number", for: "exaggeration" }, "1×");
@@ -29,7 +30,10 @@ export class SceneView {
       "aria-label": "Exaggeration of the roof's motion",
       oninput: () => this.#exaggerate(),
     });
-    this.message = h("div", { class: "pane-note", hidden: true, role: "status" });
+    this.cover = new SceneCover(host, projectId, () => {
+      this.#wish.take = true;
+      this.show(this.#wish.frame);
+    });
     this.bar = h(
       "div",
       { class: "scene-bar" },
@@ -37,7 +41,11 @@ export class SceneView {
       this.slider,
       this.amount,
     );
-    host.append(this.message, this.bar);
+    host.append(this.bar);
+    events.on("scene", ({ owner }) => {
+      if (this.cover.isElsewhere(owner)) this.cover.show({ ready: false, message: "", owner });
+    });
+    events.on("hello", () => this.#active && this.show(this.#wish.frame));
   }
 
   /** Open the scene when it is first seen. @param {boolean} active @param {number} frame */
@@ -45,13 +53,7 @@ export class SceneView {
     this.#active = active;
     if (!active) return;
     if (this.host.querySelector("iframe") === null) {
-      this.host.prepend(
-        h("iframe", {
-          class: "scene-frame",
-          title: "3D scene: cloud, camera and roof lines",
-          src: "/viser/?hideViserLogo",
-        }),
-      );
+      this.host.prepend(sceneFrame("3D scene: cloud, camera and roof lines"));
     }
     this.#wish.points ||= pointsShown();
     this.show(frame);
@@ -80,11 +82,13 @@ export class SceneView {
     while (this.#changed && this.#active) {
       this.#changed = false;
       try {
-        const { ready, message } = await post(projectPath(this.projectId, "scene"), this.#wish);
-        this.#tell(ready ? "" : message);
-        if (!ready) await this.#later();
+        const answer = await post(projectPath(this.projectId, "scene"), this.#wish);
+        this.cover.show(answer);
+        const elsewhere = this.cover.isElsewhere(answer.owner);
+        if (!elsewhere) this.#wish.take = false;
+        if (!answer.ready && !elsewhere) await this.#later();
       } catch (error) {
-        this.#tell(sentence(error));
+        this.cover.tell(sentence(error));
       }
       await new Promise((resolve) => window.setTimeout(resolve, LEAST_PAUSE_MS));
     }
@@ -95,11 +99,5 @@ export class SceneView {
   async #later() {
     await new Promise((resolve) => window.setTimeout(resolve, ASKS_AGAIN_MS));
     this.#changed = true;
-  }
-
-  /** @param {string} words */
-  #tell(words) {
-    this.message.hidden = !words;
-    fill(this.message, words);
   }
 }

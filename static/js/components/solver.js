@@ -1,6 +1,7 @@
 // Solving again after a decision that needs no video: exclusions, intervals, drift. Takes the engine a few seconds.
 
 import { ApiError, post, projectPath } from "../lib/api.js";
+import { told } from "../lib/problems.js";
 import { isRunning } from "./job-card.js";
 import { toast, toastError } from "./toast.js";
 
@@ -55,7 +56,7 @@ export class Solver {
   #onJob(job) {
     if (job.kind !== "track") return;
     this.#setBusy(isRunning(job));
-    if (job.state === "failed") toast(job.message ?? "The results could not be made.", { tone: "bad" });
+    if (job.state === "failed") toast(told(job.message || "The results could not be made.").words, { tone: "bad" });
     if (!isRunning(job) && this.#again) void this.#solve();
   }
 

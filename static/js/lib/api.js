@@ -1,5 +1,7 @@
 // Every word exchanged with the server goes through here. Errors arrive as one sentence of the engine.
 
+import { told } from "./problems.js";
+
 const GUARD = { "X-Rooftrack": "1" };
 
 /** What the server refused, in the engine's own sentence. */
@@ -98,4 +100,4 @@ export function upload(method, path, file, onProgress, signal) {
 export const isAbort = (error) => error instanceof DOMException && error.name === "AbortError";
 
 /** A sentence for a person. @param {unknown} error */
-export const sentence = (error) => (error instanceof Error ? error.message : String(error));
+export const sentence = (error) => told(error instanceof Error ? error.message : String(error)).words;

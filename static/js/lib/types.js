@@ -33,7 +33,7 @@
  *
  * @typedef {{file: string, time: string, x: string, y: string, at_m: Point | null}} GpsInput
  *
- * @typedef {"done" | "todo" | "warn" | "error" | "stale" | "running"} StepStatus
+ * @typedef {"done" | "todo" | "warn" | "error" | "stale" | "running" | "unneeded"} StepStatus
  * @typedef {"inputs" | "orthoimage" | "correspondences" | "regions" | "track" | "review" | "drift" | "export"} StepName
  * @typedef {Record<StepName, {status: StepStatus, message: string}>} Steps
  *

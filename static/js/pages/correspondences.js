@@ -1,6 +1,6 @@
 // Step 3: pairs of places in the reference frame and on the orthoimage. Two panes, no modes.
 
-import { ApiError, get, post, projectPath, sentence } from "../lib/api.js";
+import { ApiError, get, post, projectPath } from "../lib/api.js";
 import { orthoFromWorld, subtract, worldFromOrtho } from "../lib/coordinates.js";
 import { find, h } from "../lib/dom.js";
 import { downloadText, pickFiles } from "../lib/download.js";
@@ -12,6 +12,7 @@ import { activePane, nudgeKeys, paneKeys } from "../components/pane-keys.js";
 import { menuButton } from "../components/menu.js";
 import { numberField } from "../components/number-field.js";
 import { openPage } from "../components/page.js";
+import { noteContent, stepButton } from "../components/problem-note.js";
 import { announce, toast, toastError } from "../components/toast.js";
 import { toggleButton } from "../components/toggle-button.js";
 import { askAboutImport, askAboutPairs } from "./correspondences/ask-about-pairs.js";
@@ -321,7 +322,7 @@ async function loadFrame() {
     frame.refresh();
     void findGhosts();
   } catch (error) {
-    frame.chrome.setNote(sentence(error));
+    frame.chrome.setNote(...noteContent(error, page));
   }
 }
 
@@ -331,18 +332,16 @@ async function loadOrtho() {
     const answer = await get(projectPath(page.id, "orthoimage"));
     grid = answer.grid;
     if (!answer.ready) {
-      const words =
-        store.project.inputs.cloud === null
-          ? "This project has no point cloud. Click the frame, then type the ground coordinates on the right."
-          : "There is no orthoimage yet.";
-      ortho.chrome.setNote(
-        words,
-        h(
-          "a",
-          { class: "button primary", href: `/p/${encodeURIComponent(page.id)}/orthoimage` },
-          "Make the orthoimage",
-        ),
-      );
+      if (store.project.inputs.cloud === null)
+        ortho.chrome.setNote(
+          "This project has no point cloud. Click the frame and type the ground coordinates on the right, or choose a cloud.",
+          stepButton(page.id, "inputs", "Choose a point cloud"),
+        );
+      else
+        ortho.chrome.setNote(
+          "There is no orthoimage yet.",
+          stepButton(page.id, "orthoimage", "Make the orthoimage"),
+        );
       return;
     }
     const here = answer.grid;
@@ -360,7 +359,7 @@ async function loadOrtho() {
     ortho.refresh();
     showFit();
   } catch (error) {
-    ortho.chrome.setNote(sentence(error));
+    ortho.chrome.setNote(...noteContent(error, page));
   }
 }
 

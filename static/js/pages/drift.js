@@ -22,7 +22,8 @@ import { toastError } from "../components/toast.js";
 /** @typedef {{dx: (number | null)[], dy: (number | null)[]}} Pair */
 /** @typedef {{dx: number, dy: number}} Rms */
 /** @typedef {{time_s: number[], raw: Pair, filtered: Pair, filtered_pre_event_rms_m: Rms | null, warnings: string[]}} DriftAnswer */
-/** @typedef {{corners_hz: number[], rms_m: Pair, knee_hz: number | null}} Sweep */
+/** @typedef {{rms_m: Rms, least_m: Rms}} Knee what remains there, and the least that a higher corner leaves */
+/** @typedef {{corners_hz: number[], rms_m: Pair, knee_hz: number | null, knee: Knee | null}} Sweep */
 /** @typedef {{frequency_hz: number[], dx_m: number[], dy_m: number[]}} Spectrum */
 
 const LOWEST_HZ = 0.05;
@@ -36,6 +37,7 @@ const { store } = page;
 let results = await whenMeasured(
   page,
   "Track the video first; the drift left in its history can then be looked at here.",
+  { byMethod: true },
 );
 
 let axis = viewText("axis") === "y" ? "y" : "x";
@@ -368,12 +370,16 @@ function showSweep(newest) {
   sweepPlot.setTraces(traces, [newest.corners_hz, newest.rms_m.dx, newest.rms_m.dy]);
   kneeButton.hidden = newest.knee_hz === null;
   if (newest.knee_hz !== null) kneeButton.textContent = `Take the knee, ${fixed(newest.knee_hz, 3)} Hz`;
-  kneeWords.textContent =
-    newest.knee_hz === null
-      ? "The curve has no knee: no corner frequency stands out."
-      : `Above ${fixed(newest.knee_hz, 3)} Hz a higher corner hardly makes the pre-event quieter.`;
+  kneeWords.textContent = wordsOfKnee(newest.knee);
   kneeWords.hidden = false;
   markCorner();
+}
+
+/** What the knee is, in figures that the plot beside it shows too: on one axis the curve may fall on. @param {Knee | null} knee */
+function wordsOfKnee(knee) {
+  if (knee === null) return "The curve has no knee: no corner frequency stands out.";
+  const east_north = (/** @type {Rms} */ { dx, dy }) => `${millimetres(dx)} east and ${millimetres(dy)} north`;
+  return `At the knee, nine tenths of what can be filtered out are gone: ${east_north(knee.rms_m)} remain. Higher corners leave ${east_north(knee.least_m)} at best, and take more of a residual or a slow building.`;
 }
 
 /** @param {unknown} error */

@@ -20,8 +20,8 @@ import { toast, toastError } from "../components/toast.js";
 /** @typedef {import("../components/histories.js").ResultFile} ResultFile */
 /** @typedef {{time_s: number[], dx_m: (number | null)[], dy_m: (number | null)[]}} Curve */
 /** @typedef {"peak_positive" | "peak_negative" | "residual"} Quantity */
-/** @typedef {{quantity: Quantity, axis: "x" | "y", video_m: number, gps_m: number, error_m: number, error_percent: number | null}} TableRow */
-/** @typedef {{gps: Curve | null, video: Curve, error: Curve | null, lag_s: number | null, lag_sigma_s?: number | null, rms_m: {x: number, y: number} | null, table: TableRow[], message: string}} Validation */
+/** @typedef {{quantity: Quantity, axis: "x" | "y", video_m: number, gps_m: number, error_m: number, error_percent: number | null, video_at_gps_m?: number | null, error_at_gps_m?: number | null}} TableRow */
+/** @typedef {{gps: Curve | null, video: Curve, error: Curve | null, lag_s: number | null, lag_sigma_s?: number | null, rms_m: {x: number, y: number} | null, table: TableRow[], message: string, is_coarse?: boolean, spacing?: string}} Validation */
 
 /** @type {{name: Quantity, title: string}[]} */
 const QUANTITIES = [
@@ -238,6 +238,7 @@ function showGps() {
         figure(lagWords(compared.lag_s), "clock lag, applied"),
       ),
     compared && h("p", { class: "small soft" }, lagSentence(compared)),
+    compared?.spacing && h("p", { class: "small soft" }, compared.spacing),
   );
 }
 
@@ -348,16 +349,31 @@ function comparisonTable(rows) {
     h(
       "tbody",
       {},
-      AXES.map((entry) =>
+      AXES.flatMap((entry) => [
         h(
           "tr",
           {},
           h("th", { scope: "row" }, entry.name),
           QUANTITIES.flatMap(({ name }) => cells(name, entry.value)),
         ),
-      ),
+        validation?.is_coarse && instantRow(rows, entry),
+      ]),
     ),
   );
+}
+
+/** Peaks at the instants of the GPS ones, where its samples straddle the video's. @param {TableRow[]} rows @param {typeof AXES[number]} axis */
+function instantRow(rows, axis) {
+  const cells = QUANTITIES.flatMap(({ name }) => {
+    const row = rows.find((entry) => entry.quantity === name && entry.axis === axis.value);
+    if (row?.video_at_gps_m == null || row.error_at_gps_m == null) return [h("td", { class: "group", colspan: 3 })];
+    return [
+      h("td", { class: "number group" }, fixed(row.video_at_gps_m * 100, 2)),
+      h("td", { class: "number" }, fixed(row.gps_m * 100, 2)),
+      h("td", { class: "number strong" }, fixed(row.error_at_gps_m * 100, 2)),
+    ];
+  });
+  return h("tr", { class: "at-gps" }, h("th", { scope: "row", class: "soft" }, "at the GPS instant"), cells);
 }
 
 /** Without GPS: what the video alone tells, P1 and P2. */

@@ -3,6 +3,7 @@
 import { get, projectPath } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
+import { told } from "../lib/problems.js";
 import { stepUrl } from "../components/header.js";
 import { isRunning, jobCard } from "../components/job-card.js";
 import { openPage } from "../components/page.js";
@@ -31,14 +32,14 @@ const KINDS = /** @type {const} */ ([
     kind: "video",
     title: "Video",
     glyph: "video",
-    accept: "video/*",
+    accept: "video/*,.mp4,.mov,.m4v,.mkv,.avi,.mts,.m2ts,.ts,.webm",
     why: "A drone video of the structure from above, ground around it in view.",
   },
   {
     kind: "cloud",
     title: "Point cloud",
     glyph: "cube",
-    accept: ".las,.laz,.ply,.pcd,.xyz,.pts,.csv,.e57",
+    accept: ".las,.laz,.ply,.pcd,.xyz,.pts,.txt,.csv,.e57",
     why: "A LiDAR cloud of the site: it ties the picture to metres and gives the roof's height.",
   },
   {
@@ -52,7 +53,7 @@ const KINDS = /** @type {const} */ ([
     kind: "gps",
     title: "GPS",
     glyph: "clock",
-    accept: ".csv",
+    accept: ".csv,.txt",
     why: "Optional: a GPS record on the roof, to compare the result with.",
   },
 ]);
@@ -63,9 +64,11 @@ const calibrate = h(
   icon("target", "small"),
   "Calibrate…",
 );
+/** @type {string[]} of the GPS file */
+let columnsFound = [];
 const columns = h(
   "button",
-  { class: "button small", type: "button", onclick: () => void gpsSettings(store).catch(toastError) },
+  { class: "button small", type: "button", onclick: () => void gpsSettings(store, columnsFound).catch(toastError) },
   icon("edit", "small"),
   "Columns…",
 );
@@ -128,7 +131,8 @@ async function load({ again = false } = {}) {
   try {
     const facts = await get(projectPath(page.id, "inputs", again ? { again: 1 } : {}));
     for (const [kind, card] of cards) card.show(facts[kind]);
-    columns.hidden = facts.gps === null;
+    columnsFound = facts.gps?.columns_found ?? [];
+    columns.hidden = columnsFound.length === 0;
   } catch (error) {
     toastError(error);
   }
@@ -136,10 +140,10 @@ async function load({ again = false } = {}) {
 
 /** Only what concerns the files themselves: later steps tell their own. */
 function showProblems() {
-  const own = (store.state.problems ?? []).filter((problem) => problem.startsWith("inputs"));
+  const own = (store.state.problems ?? []).map((problem) => told(problem)).filter(({ step }) => step === "inputs");
   fill(
     problems,
-    own.map((problem) => h("p", { class: "note warn" }, icon("warn"), h("span", {}, problem))),
+    own.map(({ words }) => h("p", { class: "note warn" }, icon("warn"), h("span", {}, words))),
   );
 }
 

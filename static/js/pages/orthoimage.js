@@ -11,10 +11,12 @@ import { isRunning, jobCard } from "../components/job-card.js";
 import { note } from "../components/notes.js";
 import { numberField } from "../components/number-field.js";
 import { openPage } from "../components/page.js";
+import { noteContent, stepButton } from "../components/problem-note.js";
 import { Pane } from "../components/pane.js";
 import { paneChrome } from "../components/pane-chrome.js";
 import { PaneImage } from "../components/pane-image.js";
 import { paneKeys } from "../components/pane-keys.js";
+import { sceneFrame } from "../components/scene-cover.js";
 import { segmented } from "../components/segmented.js";
 import { toast, toastError } from "../components/toast.js";
 import { extentFields } from "./orthoimage/extent-fields.js";
@@ -54,8 +56,6 @@ const chrome = paneChrome(pane, {
             .join(", ")} m`,
         ],
 });
-const sceneNote = h("div", { class: "pane-note", hidden: true, role: "status" });
-find("#scene").append(sceneNote);
 const tabs = segmented({
   label: "View",
   choices: /** @type {{value: Tab, name: string}[]} */ ([
@@ -76,18 +76,11 @@ function showTab(tab) {
   if (tab === "scene") openScene();
 }
 
-function openScene() {
-  if (find("#scene").querySelector("iframe") === null)
-    find("#scene").prepend(
-      h("iframe", { class: "scene-frame", title: "3D scene of the point cloud", src: "/viser/?hideViserLogo" }),
-    );
-  scene.send();
-}
+const isSceneOpen = () => find("#scene").querySelector("iframe") !== null;
 
-/** @param {string} message */
-function tellScene(message) {
-  sceneNote.hidden = message === "";
-  sceneNote.textContent = message;
+function openScene() {
+  if (!isSceneOpen()) find("#scene").prepend(sceneFrame("3D scene of the point cloud"));
+  scene.send();
 }
 
 // --- heights
@@ -119,7 +112,7 @@ function drawPick() {
 
 // --- panels
 
-const scene = scenePanel(find("#scene-settings"), page.id, tellScene);
+const scene = scenePanel(find("#scene-settings"), page.id, find("#scene"));
 const ground = h("div", { class: "settings" });
 const groundLevel = numberField({
   label: "Ground level in the cloud",
@@ -173,6 +166,7 @@ const make = h(
 );
 const facts = h("div", { class: "settings" });
 const job = jobCard();
+let making = false;
 fill(
   find("#raster"),
   h("header", {}, h("h2", {}, "Orthoimage"), h("span", { class: "badge", id: "raster-state" })),
@@ -210,7 +204,8 @@ async function start() {
 function showJob(running) {
   if (running === null || !["orthoimage", "cloud"].includes(running.kind)) return;
   job.show(running);
-  make.disabled = isRunning(running);
+  making = isRunning(running);
+  make.disabled = making;
   if (running.state === "done") void load();
 }
 
@@ -220,6 +215,7 @@ function showSettings() {
   groundLevel.set(orthoimage.ground_z_m);
   extent.show(orthoimage.extent_m, grid === null ? null : extentOf(grid));
   inView.disabled = grid === null;
+  make.disabled = store.project.inputs.cloud === null || making;
 }
 
 /** Outer edges of a raster. @param {OrthoGrid} raster @returns {Extent} */
@@ -247,14 +243,11 @@ async function load() {
     showSettings();
     if (answer.job) showJob(answer.job);
     if (answer.ready) await showPicture(answer);
-    else
-      chrome.setNote(
-        store.project.inputs.cloud === null
-          ? "This project has no point cloud."
-          : "There is no orthoimage yet: choose pixel and extent on the right, and make it.",
-      );
+    else if (store.project.inputs.cloud === null)
+      chrome.setNote("This project has no point cloud.", stepButton(page.id, "inputs", "Choose a point cloud"));
+    else chrome.setNote("There is no orthoimage yet: choose pixel and extent on the right, and make it.");
   } catch (error) {
-    chrome.setNote(sentence(error));
+    chrome.setNote(...noteContent(error, page));
   }
 }
 
@@ -348,10 +341,16 @@ store.on("change", ({ project, previous, origin }) => {
   if (origin === "saved" || changed) void load();
 });
 page.events.on("job", showJob);
-page.events.on("hello", ({ job: running }) => showJob(running));
+page.events.on("hello", ({ job: running }) => {
+  showJob(running);
+  if (isSceneOpen()) scene.send(); // another window may have taken the scene meanwhile
+});
+page.events.on("scene", ({ owner }) => {
+  if (scene.cover.isElsewhere(owner)) scene.cover.show({ ready: false, message: "", owner });
+});
 page.events.on("inputs", () => {
   void load();
-  scene.send();
+  if (isSceneOpen()) scene.send();
 });
 page.events.on("orthoimage", () => {
   madeTimes += 1;

@@ -5,6 +5,7 @@ import { fill, find, h, svg } from "../lib/dom.js";
 import { pickFiles } from "../lib/download.js";
 import { ago, fixed } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
+import { told } from "../lib/problems.js";
 import { bindKeys } from "../lib/keys.js";
 import { askText } from "../components/dialog.js";
 import { STEPS, projectsHeader, statusMark, stepUrl } from "../components/header.js";
@@ -60,18 +61,31 @@ async function load() {
   }
 }
 
+/** The video's first frame. @param {Listed} project */
+const still = (project) =>
+  h("img", {
+    class: "still",
+    alt: "",
+    loading: "lazy",
+    src: `/api/${projectPath(project.id, "frames/0.jpg", { w: 360 })}`,
+    onerror: (/** @type {Event} */ event) => /** @type {Element} */ (event.target).replaceWith(placeholder()),
+  });
+
+const placeholder = () => h("div", { class: "still placeholder" }, icon("video"));
+
 /** @param {Listed} project */
 function card(project) {
   const hasVideo = project.steps.inputs.status !== "todo";
-  const next = STEPS.find(({ step }) => project.steps[step].status !== "done");
+  const next = STEPS.find(({ step }) => !["done", "unneeded"].includes(project.steps[step].status));
   const steps = STEPS.map(({ step, name }, i) => {
     const { status, message } = project.steps[step];
+    const words = told(message).words;
     return h(
       "li",
       {},
       h(
         "a",
-        { href: stepUrl(project.id, step), title: `${name}: ${message}` },
+        { href: stepUrl(project.id, step), title: `${name}: ${words}` },
         statusMark(status, i + 1),
         h("span", { class: "name" }, name),
       ),
@@ -80,13 +94,7 @@ function card(project) {
   return h(
     "article",
     { class: "card project-card", "data-project": project.id },
-    h("img", {
-      class: `still ${hasVideo ? "" : "missing"}`,
-      alt: "",
-      loading: "lazy",
-      src: hasVideo && `/api/${projectPath(project.id, "frames/0.jpg", { w: 360 })}`,
-      onerror: (/** @type {Event} */ event) => /** @type {Element} */ (event.target).classList.add("missing"),
-    }),
+    hasVideo ? still(project) : placeholder(),
     h(
       "header",
       {},
@@ -98,7 +106,7 @@ function card(project) {
     h(
       "p",
       { class: "small soft" },
-      next === undefined ? "All steps done." : `${next.name}: ${project.steps[next.step].message}`,
+      next === undefined ? "All steps done." : `${next.name}: ${told(project.steps[next.step].message).words}`,
     ),
   );
 }

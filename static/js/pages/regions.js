@@ -2,10 +2,11 @@
 
 import { get, post, projectPath, sentence } from "../lib/api.js";
 import { orthoFromWorld, worldFromOrtho } from "../lib/coordinates.js";
-import { find, h } from "../lib/dom.js";
+import { find } from "../lib/dom.js";
 import { fixed } from "../lib/format.js";
 import { latest } from "../lib/latest.js";
 import { Targets, isComplete } from "../lib/targets.js";
+import { told } from "../lib/problems.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { Loupe } from "../components/loupe.js";
 import { Pane } from "../components/pane.js";
@@ -13,6 +14,8 @@ import { paneChrome } from "../components/pane-chrome.js";
 import { PaneImage } from "../components/pane-image.js";
 import { activePane, nudgeKeys, paneKeys } from "../components/pane-keys.js";
 import { openPage } from "../components/page.js";
+import { colourOf } from "../components/palette.js";
+import { noteContent, stepButton } from "../components/problem-note.js";
 import { PolygonEditor } from "../components/polygon-editor.js";
 import { segmented } from "../components/segmented.js";
 import { toastError } from "../components/toast.js";
@@ -76,6 +79,7 @@ const moving = new PolygonEditor(framePane, {
   save: (label, polygons, merge) =>
     void store.edit(label, (draft) => void (draft.moving_regions_px = polygons.map(tenths)), { merge }),
   accepts: () => framePane.image !== null,
+  numbered: true,
 });
 /** @type {PolygonEditor} */
 const region = new PolygonEditor(planPane, {
@@ -140,13 +144,17 @@ function draw() {
   framePane.setShapes([...moving.shapes(), ...previewShapes(preview, "raw", same)]);
   const isPoints = targets.selected?.kind === "points";
   planPane.setShapes([...(isPoints ? region.shapes() : bands.shapes()), ...previewShapes(preview, "plan", toPixels)]);
-  frameChrome.setHint(
-    moving.isDrawing ? (moving.draft.length < 3 ? "Click the next corner" : "Enter or a double click closes") : "",
-  );
+  frameChrome.setHint(frameHint());
   planChrome.setHint(planHint());
   find("#bands").hidden = isPoints;
   showBands(preview);
   showMoving(store.project.moving_regions_px, moving.selected?.polygon ?? null);
+}
+
+function frameHint() {
+  if (moving.isDrawing) return moving.draft.length < 3 ? "Click the next corner" : "Enter or a double click closes";
+  const first = framePane.image !== null && store.project.moving_regions_px.length === 0;
+  return first ? "Click the first corner of what moves" : "";
 }
 
 function planHint() {
@@ -318,9 +326,16 @@ async function loadFrame() {
     );
     frameChrome.setTitle(`Frame ${store.project.reference_frame} · raw`);
     frameChrome.setNote();
+    draw();
   } catch (error) {
-    frameChrome.setNote(sentence(error));
+    frameChrome.setNote(...noteContent(error, page));
   }
+}
+
+/** The colour around both pictures, as six hexadecimal digits. */
+function surround() {
+  const [red, green, blue] = (colourOf(planPane.element, "--image-surround").match(/\d+/g) ?? []).map(Number);
+  return [red, green, blue].map((level) => (level ?? 0).toString(16).padStart(2, "0")).join("");
 }
 
 async function loadPlan() {
@@ -328,19 +343,18 @@ async function loadPlan() {
   try {
     const answer = await get(projectPath(page.id, "rectified"));
     if (!answer.ready) {
+      const { words, step } = told(answer.message);
       planChrome.setNote(
-        answer.message,
-        h(
-          "a",
-          { class: "button primary", href: `/p/${encodeURIComponent(page.id)}/correspondences` },
-          "Place correspondences",
-        ),
+        words,
+        step === "inputs"
+          ? stepButton(page.id, "inputs")
+          : stepButton(page.id, "correspondences", "Place correspondences"),
       );
       return;
     }
     grid = answer.grid;
     planPane.setImage(
-      await PaneImage.load(`/api/${projectPath(page.id, "rectified.jpg", { v: store.revision })}`, {
+      await PaneImage.load(`/api/${projectPath(page.id, "rectified.jpg", { v: store.revision, outside: surround() })}`, {
         onLevel: () => planPane.invalidate(),
       }),
     );
@@ -348,7 +362,7 @@ async function loadPlan() {
     draw();
     refreshPreview();
   } catch (error) {
-    planChrome.setNote(sentence(error));
+    planChrome.setNote(...noteContent(error, page));
   }
 }
 

@@ -114,7 +114,7 @@ const view = new FrameView(
   new FrameLibrary(page.id, { size: [video.width, video.height], count: video.frames }),
   method,
 );
-const scene = new SceneView(sceneBox, page.id);
+const scene = new SceneView(sceneBox, page.id, page.events);
 const player = new Player(transport);
 const plots = AXES.map(
   (axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "review", drag: "seek", leastSpan: 0.002 }),

@@ -4,19 +4,21 @@ import { get, post, projectPath, remove, sentence } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { count, duration, fixed, millimetres, pixels, plural } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
+import { told } from "../lib/problems.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { stepUrl } from "../components/header.js";
-import { AXES, fetchHistory, fetchResults, METHODS } from "../components/histories.js";
+import { AXES, fetchHistory, fetchResults, methodName, METHODS } from "../components/histories.js";
 import { isRunning } from "../components/job-card.js";
 import { note } from "../components/notes.js";
 import { openPage } from "../components/page.js";
+import { problemNote } from "../components/problem-note.js";
 import { Plot } from "../components/plot.js";
 import { segmented } from "../components/segmented.js";
 import { announce, toastError } from "../components/toast.js";
 
 /** @typedef {import("../lib/types.js").Job} Job */
 /** @typedef {[frame: number, time_s: number, dx_m: number | null, dy_m: number | null, status: string]} Row */
-/** @typedef {{job: Job | null, resumable: boolean, frames_done: number, frames_total: number, message: string | null, preview: Record<string, Row[]>}} TrackState */
+/** @typedef {{job: Job | null, resumable: boolean, frames_done: number, frames_total: number, message: string | null, first_values_after: number, preview: Record<string, Row[]>}} TrackState */
 
 // The stage of a measurement that counts frames; the others are short.
 const MEASURING = "measuring";
@@ -28,22 +30,12 @@ const STAGES = {
   orthoimage: "Making the orthoimage",
   "drawing figures": "Drawing figures",
 };
-/** Where each part of project.json is decided. @type {{path: string, step: import("../lib/types.js").StepName, name: string}[]} */
-const PLACES = [
-  { path: "inputs", step: "inputs", name: "Inputs" },
-  { path: "orthoimage", step: "orthoimage", name: "Orthoimage" },
-  { path: "correspondences", step: "correspondences", name: "Correspondences" },
-  { path: "targets", step: "regions", name: "Regions" },
-  { path: "moving_regions_px", step: "regions", name: "Regions" },
-  { path: "intervals_s", step: "drift", name: "Drift" },
-  { path: "drift", step: "drift", name: "Drift" },
-];
 
 const page = await openPage("track");
 const { store } = page;
 
 /** @type {TrackState} */
-let track = { job: null, resumable: false, frames_done: 0, frames_total: 0, message: null, preview: {} };
+let track = { job: null, resumable: false, frames_done: 0, frames_total: 0, message: null, first_values_after: 0, preview: {} };
 /** Rows by target and frame: chunks may arrive in any order. @type {Map<string, Map<number, Row>>} */
 const rows = new Map();
 /** @type {import("../components/histories.js").Results | null} */
@@ -104,6 +96,8 @@ page.keys([
 ]);
 store.on("change", show);
 page.events.on("hello", () => void catchUp());
+page.events.on("offline", show);
+page.events.on("online", show);
 page.events.on("job", onJob);
 page.events.on("track", addRows);
 page.events.on("results", () => void loadResults());
@@ -134,11 +128,16 @@ async function loadResults() {
   show();
 }
 
-/** The finished history takes the place of what was drawn while it grew. */
+/** Whether the video has been measured by the method chosen now: another one has a curve of its own. */
+function isMeasured() {
+  return results?.measured ?? false;
+}
+
+/** The finished history takes the place of what was drawn while it grew; until there is one, what was measured before. */
 async function loadHistory() {
   const name = currentTarget();
-  if (!results?.targets.includes(name)) return draw(); // drawn since: nothing measured of it yet
-  const method = results.stale && !results.measured ? results.summary?.method : undefined;
+  const method = isMeasured() ? store.project.method : results?.methods[0];
+  if (!results?.targets.includes(name) && !isMeasured()) return;
   try {
     const history = await fetchHistory(page.id, name, method);
     rows.set(
@@ -162,7 +161,7 @@ function onJob(job) {
   const ended = isRunning(track.job) && !isRunning(job);
   track = { ...track, job };
   if (ended) {
-    announce(job.state === "done" ? "The measurement is finished." : `The measurement stopped. ${job.message ?? ""}`);
+    announce(job.state === "done" ? "The measurement is finished." : `The measurement stopped. ${told(job.message ?? "").words}`);
     void catchUp();
   }
   show();
@@ -222,7 +221,7 @@ function show() {
   targetChoice.element.hidden = targetNames().length < 2;
   targetChoice.offer(targetNames().map((name) => ({ value: name, name })));
   targetChoice.set(currentTarget());
-  live.hidden = !isRunning(track.job);
+  live.hidden = !isRunning(track.job) || !page.events.online;
   showControls();
   showMethods();
   showFacts();
@@ -238,42 +237,52 @@ function draw() {
     plot.statuses = list.map((row) => row[4] ?? "ok");
     plot.setData([list.map((row) => row[1]), list.map((row) => row[2 + axis])]);
   });
-  const nothing = list.length === 0 && !isRunning(track.job);
-  plotArea.classList.toggle("faint", nothing);
+  const nothing = list.length === 0;
+  const earlier = results?.ready && !isMeasured() && !track.resumable && !isRunning(track.job);
+  plotArea.classList.toggle("faint", nothing || Boolean(earlier));
   empty.hidden = !nothing;
-  if (nothing) fill(empty, h("p", {}, "The displacement history appears here while the video is measured."));
+  const words = isRunning(track.job)
+    ? `The first values appear after ${plural(track.first_values_after, "frame")}.`
+    : "The displacement history appears here while the video is measured.";
+  if (nothing) fill(empty, h("p", {}, words));
 }
 
 function showControls() {
   const { job } = track;
   if (isRunning(job)) return showRunning(/** @type {Job} */ (job));
   const problems = store.state.problems ?? [];
-  const done = results?.ready && !results.stale && !track.resumable;
+  const done = results?.ready && !results.stale && !track.resumable && isMeasured();
   const notes = [
-    ...problems.map(problemNote),
-    job?.state === "failed" ? note("bad", job.message ?? "The measurement failed.") : null,
+    ...problems.map((problem) => problemNote("bad", problem, page)),
+    problems.length === 0 && failure() ? problemNote("bad", failure(), page) : null,
     problems.length === 0 && track.resumable ? note("info", stoppedWords()) : null,
-    problems.length === 0 && results?.stale
-      ? note("warn", store.state.steps.track.message || "The project has changed since these results were made.")
-      : null,
+    problems.length === 0 && !track.resumable && results?.ready ? earlierNote() : null,
     done && job?.state !== "failed" ? note("good", doneWords()) : null,
     ...(done ? (results?.summary?.warnings ?? []) : []).map((/** @type {string} */ warning) => note("warn", warning)),
   ];
   fill(controls, h("header", {}, h("h2", {}, "Measurement")), notes, buttons(Boolean(done)));
 }
 
-/** A problem of the project, with the page where it is put right. @param {string} problem "path: sentence" */
-function problemNote(problem) {
-  const place = PLACES.find(({ path }) => problem.startsWith(path));
-  const element = note("bad", problem);
-  if (place) element.append(h("a", { class: "note-link", href: stepUrl(page.id, place.step) }, place.name));
-  return element;
+/** Why the last measurement failed, as its job says or, after a restart, the step; empty where it did not. */
+function failure() {
+  const { status, message } = store.state.steps.track;
+  if (track.job?.state === "failed") return track.job.message || "The measurement failed.";
+  return status === "error" ? message : "";
+}
+
+/** What the curve shows while it is not the one of the project as it stands; null where it is. */
+function earlierNote() {
+  const of = methodName(results?.methods[0] ?? "").toLowerCase();
+  if (!isMeasured())
+    return note("info", `Not measured by this method yet. The faint curve is the one of the ${of} method.`);
+  if (!results?.stale) return null;
+  return note("warn", "The project has changed since these results were made: the curve and the figures are older.");
 }
 
 /** @param {boolean} done */
 function buttons(done) {
   const off = blocked();
-  const first = track.resumable ? "Resume" : results?.stale ? "Update results" : "Start";
+  const first = track.resumable ? "Resume" : results?.stale && isMeasured() ? "Update results" : "Start";
   const go = h(
     "button",
     { type: "button", class: `button ${done ? "" : "primary"}`, disabled: off, onclick: () => void start(done) },
@@ -297,8 +306,16 @@ function buttons(done) {
 /** @param {Job} job */
 function showRunning(job) {
   const share = job.total > 0 ? job.done / job.total : null;
-  const bar = h("progress", { max: 1, "aria-label": "Progress", value: share });
-  const title = STAGES[job.stage] ?? (job.stage || "Starting");
+  const { online } = page.events; // what is heard no more stands still, and is not told as going on
+  const stage = STAGES[job.stage] ?? (job.stage || "Starting");
+  const title = online ? stage : "Connection lost";
+  const bar = h("progress", { max: 1, "aria-label": "Progress", value: share, class: online ? null : "frozen" });
+  const stop = h(
+    "button",
+    { type: "button", class: "button", disabled: !online, onclick: () => void cancel() },
+    icon("close"),
+    "Cancel",
+  );
   fill(
     controls,
     h(
@@ -309,25 +326,28 @@ function showRunning(job) {
     ),
     bar,
     job.stage === MEASURING ? measuringFigures(job) : null,
-    h("p", { class: "small faint" }, "You may close this tab: the measurement goes on, and every frame is kept."),
     h(
-      "div",
-      { class: "toolbar" },
-      h("button", { type: "button", class: "button", onclick: () => void cancel() }, icon("close"), "Cancel"),
+      "p",
+      { class: "small faint" },
+      online
+        ? "You may close this tab: the measurement goes on, and every frame is kept."
+        : "Every frame measured so far is kept; once the server is back, the measurement goes on from there.",
     ),
+    h("div", { class: "toolbar" }, stop),
   );
 }
 
 /** @param {Job} job */
 function measuringFigures(job) {
+  const { online } = page.events;
   const figure = (/** @type {string} */ value, /** @type {string} */ name) =>
     h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
   return h(
     "div",
     { class: "figures" },
     figure(`${count(job.done)} / ${count(job.total)}`, "frames"),
-    figure(job.rate_per_s ? fixed(job.rate_per_s, 1) : "–", "frames/s"),
-    figure(duration(job.seconds_left), "left"),
+    figure(online && job.rate_per_s ? fixed(job.rate_per_s, 1) : "–", "frames/s"),
+    figure(online ? duration(job.seconds_left) : "–", "left"),
   );
 }
 
@@ -382,7 +402,7 @@ function chooseMethod(method) {
 
 function showFacts() {
   const counts = results?.summary?.targets?.[currentTarget()]?.counts;
-  facts.hidden = !results?.ready || !counts || isRunning(track.job);
+  facts.hidden = !results?.ready || !counts || !isMeasured() || isRunning(track.job);
   if (facts.hidden) return;
   const statusLine = (/** @type {string} */ status, /** @type {string} */ words) => [
     h("dt", {}, h("span", { class: `status-key ${status}` }), status),

@@ -2,6 +2,7 @@
 
 import { fill, h } from "../../lib/dom.js";
 import { icon } from "../../lib/icons.js";
+import { told } from "../../lib/problems.js";
 import { centimetres, fixed, metres, degrees, pixels } from "../../lib/format.js";
 
 /**
@@ -48,7 +49,7 @@ export function fitPanel(element) {
     fill(
       message,
       icon(fit.state === "ok" ? "check" : fit.state === "too_few" ? "info" : "warn"),
-      h("span", {}, fit.message),
+      h("span", {}, told(fit.message).words),
     );
     showCoverage(grid, fit.coverage);
     fill(

@@ -17,13 +17,13 @@ const ANTENNA = /** @type {const} */ ([
 
 /** @typedef {import("../../lib/types.js").GpsInput} GpsInput */
 
-/** @param {import("../../lib/store.js").ProjectStore} store */
-export async function gpsSettings(store) {
+/** @param {import("../../lib/store.js").ProjectStore} store @param {string[]} columns found in the file */
+export async function gpsSettings(store, columns) {
   const now = store.project.inputs.gps;
   if (now === null) return;
   const wanted = structuredClone(now);
   const at = /** @type {[number | null, number | null]} */ ([...(now.at_m ?? [null, null])]);
-  if ((await ask(wanted, at)) === null) return;
+  if ((await ask(wanted, at, columns)) === null) return;
   const [east, north] = at;
   await store.edit(
     "GPS columns",
@@ -31,8 +31,13 @@ export async function gpsSettings(store) {
   );
 }
 
-/** Write what a person types into `wanted` and `at`; null when it is not to be used. @param {GpsInput} wanted @param {[number | null, number | null]} at */
-function ask(wanted, at) {
+/**
+ * Write what a person chooses into `wanted` and `at`; null when it is not to be used.
+ * @param {GpsInput} wanted
+ * @param {[number | null, number | null]} at
+ * @param {string[]} columns
+ */
+function ask(wanted, at, columns) {
   return openDialog({
     title: "GPS columns and antenna",
     body: (close) => {
@@ -46,7 +51,7 @@ function ask(wanted, at) {
           h(
             "div",
             { class: "dialog-body" },
-            h("div", { class: "field-row" }, columnFields(wanted)),
+            h("div", { class: "field-row" }, columnFields(wanted, columns)),
             h("div", { class: "field-row" }, antennaFields(at)),
             h("p", { class: "small faint" }, hint),
           ),
@@ -57,20 +62,25 @@ function ask(wanted, at) {
   });
 }
 
-/** @param {GpsInput} wanted */
-const columnFields = (wanted) =>
+/** @param {GpsInput} wanted @param {string[]} columns */
+const columnFields = (wanted, columns) =>
   COLUMNS.map(([key, label]) => {
-    const input = h("input", {
-      class: "input",
-      id: `gps-${key}`,
-      type: "text",
-      required: true,
-      value: wanted[key],
-      spellcheck: "false",
-      oninput: () => void (wanted[key] = input.value.trim()),
-    });
-    return h("div", { class: "field" }, h("label", { class: "label", for: input.id }, label), input);
+    const choice = columnChoice(columns, wanted[key]);
+    choice.id = `gps-${key}`;
+    choice.addEventListener("change", () => (wanted[key] = choice.value));
+    return h("div", { class: "field" }, h("label", { class: "label", for: choice.id }, label), choice);
   });
+
+/** The columns of the file; what was chosen and is not among them has to be chosen anew. @param {string[]} columns @param {string} chosen */
+function columnChoice(columns, chosen) {
+  const known = columns.includes(chosen);
+  return h(
+    "select",
+    { class: "input", required: true },
+    known ? null : h("option", { value: "", selected: true, disabled: true }, `no “${chosen}” here`),
+    columns.map((name) => h("option", { value: name, selected: name === chosen }, name)),
+  );
+}
 
 /** @param {[number | null, number | null]} at */
 const antennaFields = (at) =>

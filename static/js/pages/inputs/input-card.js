@@ -3,8 +3,9 @@
 import { fill, h } from "../../lib/dom.js";
 import { pickFiles } from "../../lib/download.js";
 import { icon } from "../../lib/icons.js";
+import { told } from "../../lib/problems.js";
 import { duration, fixed, size } from "../../lib/format.js";
-import { projectPath, upload } from "../../lib/api.js";
+import { get, projectPath, upload } from "../../lib/api.js";
 import { chooseFiles } from "../../components/file-browser.js";
 import { toast, toastError } from "../../components/toast.js";
 import { factList } from "./facts.js";
@@ -89,8 +90,8 @@ async function chooseInput({ kind, title, onPath }) {
 async function sendInput(file, transfer, { projectId, kind, onChange }) {
   try {
     await sendWithProgress(transfer, projectPath(projectId, `upload/${kind}`, { filename: file.name }), file);
-    toast(`${file.name} is here.`, { tone: "good" });
     onChange();
+    await tellUnderstood(projectId, kind, file.name);
   } catch (error) {
     toastError(error);
   }
@@ -107,7 +108,7 @@ function stateOf(facts) {
 function understood({ projectId, kind, why }, facts) {
   if (facts === null) return [h("p", { class: "soft" }, why)];
   const path = h("p", { class: "path" }, facts.file);
-  if (facts.error) return [path, h("p", { class: "note bad" }, icon("warn"), h("span", {}, facts.error.message))];
+  if (facts.error) return [path, h("p", { class: "note bad" }, icon("warn"), h("span", {}, told(facts.error.message).words))];
   if (facts.reading) return [path, h("progress", { "aria-label": "Reading" })];
   return [factList(kind, facts), kind === "video" && still(projectId, facts.file)];
 }
@@ -119,6 +120,14 @@ const still = (projectId, file) =>
     alt: "First frame",
     src: `/api/${projectPath(projectId, "frames/0.jpg", { w: 480, v: file })}`,
   });
+
+/** Say that a file is understood, once it is; what is wrong with one stands on its card. @param {string} projectId @param {InputKind} kind @param {string} name */
+async function tellUnderstood(projectId, kind, name) {
+  const facts = (await get(projectPath(projectId, "inputs")))[kind];
+  if (facts === null || facts.error) return;
+  if (facts.reading) toast(`${name} is here and being read.`);
+  else toast(`${name} is understood.`, { tone: "good" });
+}
 
 /** Stream a file, showing how far it is, with a way to stop. @param {HTMLElement} place @param {string} path @param {File} file */
 export async function sendWithProgress(place, path, file) {

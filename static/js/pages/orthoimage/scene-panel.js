@@ -5,6 +5,7 @@ import { fill, h } from "../../lib/dom.js";
 import { count, plural } from "../../lib/format.js";
 import { pointsShown } from "../../lib/graphics.js";
 import { latest } from "../../lib/latest.js";
+import { SceneCover } from "../../components/scene-cover.js";
 import { segmented } from "../../components/segmented.js";
 import { toastError } from "../../components/toast.js";
 
@@ -23,8 +24,8 @@ const PARTS = /** @type {const} */ ([
   ["lines", "Lines"],
 ]);
 
-/** @param {HTMLElement} element @param {string} projectId @param {(message: string) => void} onMessage */
-export function scenePanel(element, projectId, onMessage) {
+/** @param {HTMLElement} element @param {string} projectId @param {HTMLElement} view what holds the 3D view */
+export function scenePanel(element, projectId, view) {
   const wish = {
     colour: "rgb",
     points: pointsShown(),
@@ -35,12 +36,18 @@ export function scenePanel(element, projectId, onMessage) {
       camera: true,
       lines: true,
     }),
+    take: true, // who opens the page wants to see this project
   };
+  const cover = new SceneCover(view, projectId, () => {
+    wish.take = true;
+    send();
+  });
   const shown = h("p", { class: "small faint number", role: "status" });
   const ask = latest(
     (/** @type {typeof wish} */ wanted) => post(projectPath(projectId, "scene"), wanted),
     (answer) => {
-      onMessage(answer.ready === false ? answer.message : "");
+      cover.show(answer);
+      if (!cover.isElsewhere(answer.owner)) wish.take = false;
       if (answer.points_total)
         shown.textContent = `${count(answer.points_shown)} of ${plural(answer.points_total, "point")} drawn; the engine uses all`;
     },
@@ -78,5 +85,5 @@ export function scenePanel(element, projectId, onMessage) {
     h("div", { class: "parts" }, parts),
     shown,
   );
-  return { send };
+  return { send, cover };
 }

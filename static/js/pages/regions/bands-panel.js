@@ -2,6 +2,7 @@
 
 import { fill, h } from "../../lib/dom.js";
 import { icon } from "../../lib/icons.js";
+import { told } from "../../lib/problems.js";
 import { count, metres, pixels } from "../../lib/format.js";
 import { numberField } from "../../components/number-field.js";
 import { LINE_NAMES, lengthOf, rounded } from "./band.js";
@@ -65,7 +66,7 @@ export function bandsPanel(element, editor, save) {
     message.hidden = !preview?.message;
     const tone = toneOf(Math.abs(preview?.p1_p2_error ?? 0));
     message.className = `note ${tone}`;
-    fill(message, icon(tone === "" ? "info" : "warn"), h("span", {}, preview?.message ?? ""));
+    fill(message, icon(tone === "" ? "info" : "warn"), h("span", {}, told(preview?.message ?? "").words));
   };
 }
 
@@ -123,7 +124,7 @@ class BandRow {
     if (this.editor.nextLine === this.line) return NEXT_CLICK[this.editor.draft.length];
     if (band === null) return WORDS[this.line];
     if (preview === null) return metres(lengthOf(band));
-    return preview.message || `${count(preview.points)} points, ${pixels(preview.rms_px)}`;
+    return told(preview.message ?? "").words || `${count(preview.points)} points, ${pixels(preview.rms_px)}`;
   }
 }
 

@@ -8,11 +8,12 @@ import { icon } from "../../lib/icons.js";
 
 const ADVICE =
   "Outline everything that moves: building, table, its shadow. Nothing inside is used to follow the camera.";
+const HOW = "Click the corners in the left picture, one after the other; Enter or a double click closes the outline.";
 
 /** @param {HTMLElement} element @param {{onSelect: (index: number) => void, onRemove: (index: number) => void}} options */
 export function movingPanel(element, { onSelect, onRemove }) {
   const list = h("ul", { class: "target-list" });
-  fill(element, h("header", {}, h("h2", {}, "Moving regions")), list);
+  fill(element, h("header", {}, h("h2", {}, "Moving regions")), list, h("p", { class: "small faint" }, HOW));
   const row = (/** @type {Point[]} */ corners, /** @type {number} */ index, /** @type {boolean} */ selected) => {
     const name = `Region ${index + 1}`;
     const look = { class: "button quiet small icon-only", type: "button", "aria-label": `Delete region ${index + 1}` };
