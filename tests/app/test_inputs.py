@@ -52,8 +52,9 @@ def test_a_file_that_is_sent_replaces_nothing_but_that_very_input(
 ) -> None:
     (workspace / "small" / "notes.yaml").write_text("no input, but somebody's file")
     before = {path.name: path.read_bytes() for path in (workspace / "small").iterdir() if path.is_file()}
-    assert send(client, kind, name, b"new").json()["file"] == free
-    assert (workspace / "small" / free).read_bytes() == b"new"
+    new = (workspace / "small" / ("gps.csv" if kind == "gps" else "lens.yaml")).read_bytes() + b"\n"
+    assert send(client, kind, name, new).json()["file"] == free
+    assert (workspace / "small" / free).read_bytes() == new
     for other in before.keys() - {free, "project.json", "history.sqlite"}:
         assert (workspace / "small" / other).read_bytes() == before[other]
     inputs = client.get(SMALL).json()["project"]["inputs"]
@@ -61,12 +62,12 @@ def test_a_file_that_is_sent_replaces_nothing_but_that_very_input(
     assert kept is None or inputs[kept] == name
 
 
-def test_a_name_kept_for_an_input_that_is_still_to_come_is_not_free(client: TestClient) -> None:
+def test_a_name_kept_for_an_input_that_is_still_to_come_is_not_free(client: TestClient, workspace: Path) -> None:
     made = client.post("/api/projects", json={"name": "empty"}).json()["id"]
-    sent = client.put(f"/api/projects/{made}/upload/lens", params={"filename": "video.mp4"}, content=b"x")
-    assert sent.json()["file"] == "video-2.mp4"
-    sent = client.put(f"/api/projects/{made}/upload/video", params={"filename": "video.mp4"}, content=b"x")
-    assert sent.json()["file"] == "video.mp4"
+    for kind, given, free in (("lens", "lens.yaml", "video-2.mp4"), ("video", "video.mp4", "video.mp4")):
+        content = (workspace / "small" / given).read_bytes()
+        sent = client.put(f"/api/projects/{made}/upload/{kind}", params={"filename": "video.mp4"}, content=content)
+        assert sent.json()["file"] == free
 
 
 def test_a_gps_record_keeps_the_names_of_its_columns(client: TestClient, workspace: Path) -> None:

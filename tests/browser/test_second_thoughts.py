@@ -211,7 +211,7 @@ def test_the_keyboard_aims_only_when_it_is_used(browser, project):
         expect(aim).to_have_count(1)
 
 
-def test_a_click_completes_the_half_that_is_selected(browser, project):
+def test_a_click_completes_the_oldest_half_or_the_one_picked_out(browser, project):
     _, pages = project
     with watched(browser, pages) as page:
         page.goto(f"{pages}/correspondences")
@@ -221,10 +221,10 @@ def test_a_click_completes_the_half_that_is_selected(browser, project):
             click_share(page, (u, 0.5))
             page.wait_for_timeout(NO_DOUBLE_CLICK_MS)
         expect(page.locator("#selection h2")).to_have_text("Pair 22, unfinished")
-        expect(hint).to_have_text("Click completes pair 22")
-        click_share(page, (0.03, 0.5))
-        expect(page.locator("#selection h2")).to_have_text("Pair 21, unfinished")
         expect(hint).to_have_text("Click completes pair 21")
+        click_share(page, (0.06, 0.5))
+        expect(page.locator("#selection h2")).to_have_text("Pair 22, unfinished")
+        expect(hint).to_have_text("Click completes pair 22")
 
 
 def test_residuals_are_as_long_in_both_pictures_and_say_how_enlarged(browser, project):

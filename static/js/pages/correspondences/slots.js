@@ -18,6 +18,8 @@ export class Slots extends Emitter {
   halves = [];
   /** @type {number | null} id of a pair or half */
   selected = null;
+  /** @type {number | null} id that was selected since the last click that placed something */
+  #picked = null;
   /** @type {Half[]} taken back, newest last, until something new is done */
   #taken = [];
   /** @type {{halves: Half[], before: number, after: number} | null} halves that went with all pairs */
@@ -38,10 +40,14 @@ export class Slots extends Emitter {
     return this.store.project.correspondences;
   }
 
-  /** The half that the next click on a side completes: the selected one, else the oldest. @param {Side} side */
+  /**
+   * The half that the next click on a side completes: the one a person picked out, else the oldest, so that places
+   * clicked one after another in one picture are completed in the same order in the other.
+   * @param {Side} side
+   */
   waitingFor(side) {
     const waiting = this.halves.filter((half) => half[side] === null);
-    return waiting.find((half) => half.id === this.selected) ?? waiting[0] ?? null;
+    return waiting.find((half) => half.id === this.#picked) ?? waiting[0] ?? null;
   }
 
   /** A click on a side: fills the next free slot, or opens one. @param {Side} side @param {Point} point @returns {number} id of the pair */
@@ -138,7 +144,7 @@ export class Slots extends Emitter {
 
   /** @param {number | null} id */
   select(id) {
-    this.selected = id;
+    this.selected = this.#picked = id;
     this.emit("change", null);
   }
 
@@ -175,6 +181,7 @@ export class Slots extends Emitter {
   #setHalves(halves, selected) {
     this.halves = halves;
     this.selected = selected;
+    this.#picked = null;
     localStorage.setItem(this.#key, JSON.stringify(halves));
     this.emit("change", null);
   }
