@@ -218,7 +218,7 @@ def _line_points(scene: Any, name: str) -> Any:
 def test_tracking_is_cancelled_goes_on_by_itself_after_a_restart_and_ends_as_if_uninterrupted(
     tracked: TestClient, tmp_path: Path
 ) -> None:
-    frames = 300  # more than the engine measures in the seconds after which it is stopped
+    frames = 800  # more than the engine measures in the seconds after which it is stopped
     write_measurable(tmp_path / "clip", frames)
     with TestClient(create_app(tmp_path), base_url=ADDRESS, headers=WRITE) as client:
         folder = client.app.state.context.workspace.open("clip")  # type: ignore[attr-defined]

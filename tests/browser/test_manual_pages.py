@@ -526,6 +526,9 @@ def test_a_narrow_window_reads_downwards(browser, project):
         assert side["y"] >= stage["y"] + stage["height"]
         expect(page.locator(".brand-name")).to_be_hidden()
         assert page.evaluate("document.documentElement.scrollWidth") == 800
+        page.set_viewport_size({"width": 480, "height": 800})
+        page.goto(f"{pages}/export")
+        expect(page.locator("[data-step=export] .name")).to_be_in_viewport(ratio=1)
         page.set_viewport_size({"width": 1920, "height": 1080})
         page.goto(f"{pages}/inputs")
         assert page.locator(".card-grid").bounding_box()["width"] > 1400

@@ -412,7 +412,7 @@ def test_a_result_from_before_a_change_says_so(browser, project):
         with watched(browser, pages) as page:
             page.on("response", lambda answer: refused.append(answer.url) if answer.status >= 400 else None)
             page.goto(f"{pages}/track")
-            expect(page.get_by_role("button", name="Update results")).to_be_visible()
+            expect(page.get_by_role("button", name="Start", exact=True)).to_be_visible()
             page.goto(f"{pages}/export")
             expect(page.get_by_role("status").filter(has_text="from before the change")).to_be_visible()
             expect(page.get_by_role("link", name="Go to Track")).to_be_visible()

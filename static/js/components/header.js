@@ -82,10 +82,12 @@ export function projectHeader(store, step, events) {
     name.textContent = store.project.name;
     name.title = store.project.name;
     document.title = `${title} · ${store.project.name} · Rooftrack`;
+    const { scrollLeft } = steps;
     fill(
       steps,
       STEPS.map((entry, i) => stepLink(state.id, entry, i + 1, stateOf(entry.step), entry.step === step)),
     );
+    steps.scrollLeft = scrollLeft;
     setAction(undo, state.can_undo, `Undo${state.undo_label ? `: ${state.undo_label}` : ""} (Ctrl+Z)`);
     setAction(redo, state.can_redo, `Redo${state.redo_label ? `: ${state.redo_label}` : ""} (Ctrl+Shift+Z)`);
   };
@@ -95,7 +97,8 @@ export function projectHeader(store, step, events) {
     working = isRunning(job) ? STEP_OF_JOB[/** @type {import("../lib/types.js").Job} */ (job).kind] : null;
     if (working === before) return;
     show();
-    if (working === null) void store.refresh().catch(toastError);
+    // The end of tracking is told as new results too, which makes the page take the new state.
+    if (working === null && job?.kind !== "track") void store.refresh().catch(toastError);
   };
   events.on("job", hear);
   events.on("hello", ({ job }) => hear(job));
@@ -103,6 +106,10 @@ export function projectHeader(store, step, events) {
   store.on("saving", (state) => showSaving(saved, state));
   show();
   showSaving(saved, "saved");
+  // In a narrow window the steps scroll, and are as wide as they stay only once their letters are there.
+  void document.fonts.ready.then(() =>
+    steps.querySelector("[aria-current]")?.scrollIntoView({ inline: "center", block: "nearest" }),
+  );
   bindKeys([
     helpKey(title),
     ...STEPS.map((entry, i) => ({
