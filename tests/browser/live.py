@@ -118,10 +118,10 @@ def measured_sample(shared: Path) -> Path:
 
 
 def eventually(holds: Callable[[], bool], seconds: float = 20.0) -> None:
-    """Wait for what the page saves by itself."""
+    """Wait for what comes about by itself."""
     end = time.monotonic() + seconds
     while not holds():
-        assert time.monotonic() < end, "the project was not saved in time"
+        assert time.monotonic() < end, "it did not come about in time"
         time.sleep(0.1)
 
 
