@@ -120,11 +120,15 @@ def _rows_of_part(here: Context, folder: ProjectFolder, project: Project) -> dic
 
 @router.get("/results")
 def results(folder: Folder, here: Here) -> dict[str, Any]:
-    """Return the summary of the results, whether they still fit the project, and their files."""
+    """Return the summary of the results, whether they still fit the project, and their files.
+
+    `measured` names the methods by which the whole video is measured as the project wants it now; `methods` also
+    the one of the results that were written last.
+    """
     project = folder.load().project
     state = outcome.state_of(folder, project)
-    methods = here.outcomes.methods(folder, project)
-    measured = project.method in methods
+    measured = here.outcomes.methods(folder, project)
+    methods = list(measured)
     if state.summary is not None and state.summary["method"] not in methods:
         methods.append(state.summary["method"])
     return {

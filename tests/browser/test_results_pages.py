@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, Response, Route, expect
+from playwright.sync_api import APIResponse, Page, Response, Route, expect
 
 from core.drift import high_pass
 from core.project import read_project
@@ -116,9 +116,39 @@ def test_a_method_not_measured_yet_is_a_state_and_no_error(browser, project):
         expect(page.locator(".plot-stack.faint")).to_be_visible()  # the other method's curve stays in sight
         eventually(lambda: read_project(folder).method == "paper")
         page.wait_for_timeout(1000)
-        expect(page.locator(".toast")).to_have_count(0)
+        assert page.locator(".toast").all_inner_texts() == []
+        with page.expect_response(lambda answer: "/review/" in answer.url) as overlay:
+            page.goto(f"{pages}/review")
+        assert overlay.value.ok  # what is measured is shown, by the method that has measured it
+        page.wait_for_timeout(1000)
+        assert page.locator(".toast").all_inner_texts() == []
         page.goto(f"{pages}/drift")
         expect(page.get_by_role("heading", name="Not measured by the paper method yet")).to_be_visible(timeout=30_000)
+
+
+def test_an_answer_from_before_a_method_was_chosen_is_not_taken_for_the_new_one(browser, project):
+    _, pages = project
+    asked: list[Route] = []
+    held: list[tuple[Route, APIResponse]] = []
+
+    def hold_the_second(route: Route) -> None:
+        asked.append(route)
+        if len(asked) == 2:
+            held.append((route, route.fetch()))
+        else:
+            route.continue_()
+
+    with watched(browser, pages) as page:
+        page.route("**/results", hold_the_second)  # a page asks at once, and when its events begin
+        page.goto(f"{pages}/track")
+        expect(page.get_by_role("link", name="Review the result")).to_be_visible(timeout=30_000)
+        page.get_by_role("radio", name="Paper").click()
+        expect(page.locator(".note.info")).to_contain_text("Not measured by this method yet")
+        route, answer = held[0]
+        route.fulfill(response=answer)
+        page.wait_for_timeout(1000)
+        expect(page.locator(".note.info")).to_contain_text("Not measured by this method yet")
+        assert page.locator(".toast").all_inner_texts() == []
 
 
 def test_a_failed_measurement_is_told_once_and_leads_to_its_remedy(browser, project):

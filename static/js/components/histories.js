@@ -32,10 +32,10 @@ import { get, projectPath } from "../lib/api.js";
  * @typedef {object} Results
  * @property {boolean} ready
  * @property {boolean} stale the project has changed since the files were made
- * @property {boolean} measured the whole video, as the project wants it now; else there is only what was before a change
+ * @property {Method[]} measured the methods that have measured the whole video as the project wants it now
  * @property {any} summary the engine's summary.json
  * @property {string[]} targets
- * @property {Method[]} methods
+ * @property {Method[]} methods these, and the one of the results written last
  * @property {ResultFile[]} files
  */
 

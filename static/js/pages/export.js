@@ -121,7 +121,7 @@ async function reload() {
 
 /** Whether only the result from before a change can be shown: nothing has been measured as the project stands now. */
 function isFromBefore() {
-  return results.stale && !results.measured;
+  return results.stale && !results.measured.includes(page.store.project.method);
 }
 
 async function loadCurves() {

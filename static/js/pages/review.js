@@ -45,7 +45,8 @@ let results = await whenMeasured(
 const { video } = await get(projectPath(page.id, "inputs"));
 
 // what is looked at
-let method = results.methods.find((name) => name === viewText("method")) ?? store.project.method;
+const has = (/** @type {string | null} */ name) => results.methods.find((method) => method === name);
+let method = has(viewText("method")) ?? has(store.project.method) ?? results.methods[0];
 let target = results.targets.find((name) => name === viewText("target")) ?? results.targets[0] ?? "";
 let compared = viewText("compare") === "1" && results.methods.length > 1;
 let stage = STAGES.find((entry) => entry.value === viewText("view"))?.value ?? "frame";

@@ -130,7 +130,7 @@ async function loadResults() {
 
 /** Whether the video has been measured by the method chosen now: another one has a curve of its own. */
 function isMeasured() {
-  return results?.measured ?? false;
+  return results?.measured.includes(store.project.method) ?? false;
 }
 
 /** The finished history takes the place of what was drawn while it grew; until there is one, what was measured before. */
