@@ -31,6 +31,7 @@ from core.project import (
     project_problems,
     read_project,
 )
+from core.roof_level import height_obstacle, scale_obstacle
 from core.storage import File, file_at
 from core.validation import read_gps
 from core.video import FrameIndex, VideoInfo, frame_index, probe
@@ -89,35 +90,15 @@ def obstacles(project: Project, index: FrameIndex | None, reference: ReferenceFi
     if reference is not None and reference.is_hopeless:
         yield str(reference.contradiction)
     for number, target in enumerate(project.targets):
-        height = _height_obstacle if project.method == "geometric" else _scale_obstacle
-        if (obstacle := height(project, target, reference)) is not None:
+        camera = None if reference is None else reference.pose
+        if project.method == "geometric":
+            obstacle = height_obstacle(target, camera)
+        else:
+            obstacle = scale_obstacle(target, camera, has_lens=project.inputs.lens is not None)
+        if obstacle is not None:
             yield f"targets[{number}].{obstacle}"
     if index is not None:
         yield from _time_obstacles(project, index)
-
-
-def _height_obstacle(project: Project, target: Target, reference: ReferenceFit | None) -> str | None:
-    """Say what keeps `geometric` from knowing a target's plane."""
-    if target.height_m is None:
-        return f'height_m: missing, but method "geometric" needs the height of "{target.name}"; add it'
-    if reference is not None and reference.pose is not None and target.height_m >= reference.pose.centre_m[2]:
-        return (
-            f"height_m: {target.height_m:g}, but by the clicks the camera hovers {reference.pose.centre_m[2]:.1f} m "
-            "above the ground; correct the height, the clicks or the lens"
-        )
-    return None
-
-
-def _scale_obstacle(project: Project, target: Target, reference: ReferenceFit | None) -> str | None:
-    """Say what keeps `paper` from knowing a target's scale."""
-    if target.kind == "points":
-        return 'kind: "points", which method "paper" does not know; choose "geometric", or mark lines'
-    if target.p1_p2_m is None and (target.height_m is None or project.inputs.lens is None):
-        return (
-            'p1_p2_m: missing; "paper" takes its scale from the known distance P1-P2, or from height_m and a lens; '
-            "add one of them"
-        )
-    return None
 
 
 def _time_obstacles(project: Project, index: FrameIndex) -> Iterator[str]:

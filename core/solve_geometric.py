@@ -13,9 +13,8 @@ import numpy as np
 
 from core.bodies import RestBody, midpoints, rest_body, world_points
 from core.calibration import Calibration, Evidence, calibrate, calibration_sigma
-from core.camera import Pose, fit_poses, plan_homographies
+from core.camera import fit_poses, plan_homographies
 from core.coordinates import Floats, evenly_spread
-from core.errors import InputError
 from core.flight import SmoothFlight, smooth_flight
 from core.georeference import ReferenceFit
 from core.ground_poses import fit_with_relief, solve_ground
@@ -26,6 +25,7 @@ from core.motion import RigidFit
 from core.project import Project, Target
 from core.relief import Relief
 from core.results import Status, TargetHistory
+from core.roof_level import height_obstacle, refuse_if, scale_at_roof
 from core.row_times import Readout, at_frame_times, estimated_readout, ground_speed
 from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution, TargetSolution, frame_status
@@ -55,7 +55,9 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
     """
     reference = fit_with_relief(project, lens, relief)
     assert reference.pose is not None
-    heights = {target.name: _height_of(target, reference.pose) for target in project.targets}
+    for target in project.targets:
+        refuse_if(height_obstacle(target, reference.pose), target)
+    heights = {target.name: target.height_m for target in project.targets if target.height_m is not None}
     start = Calibration(lens, reference.pose, heights)
     speed = ground_speed(recording, lens)
     readout = _readout(recording, speed, start, reference, relief)
@@ -90,20 +92,6 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
         readout=readout,
         warnings=(*calibration.warnings, *_warnings(project, targets, used.heights_m)),
     )
-
-
-def _height_of(target: Target, camera: Pose) -> float:
-    if target.height_m is None:
-        raise InputError(
-            f'project.json: targets.{target.name}.height_m is missing; "geometric" needs its height above '
-            'the ground, "paper" does without.'
-        )
-    if target.height_m >= camera.centre_m[2]:
-        raise InputError(
-            f"project.json: targets.{target.name}.height_m is {target.height_m:g}, but by the clicks the camera hovers "
-            f"{camera.centre_m[2]:.1f} m above the ground; correct the height, the clicks or the lens."
-        )
-    return target.height_m
 
 
 def _warnings(project: Project, targets: Mapping[str, TargetSolution], heights_m: Mapping[str, float]) -> Iterator[str]:
@@ -198,7 +186,7 @@ def _solve_target(
     apparent = world_points(midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, 0.0)
     flat = rest_body(recording, target.name, used.lens, used.pose0, 0.0)
     raw = flat.fit(apparent, np.zeros(len(apparent), dtype=bool))
-    scale = _paper_scale(target, flat, used.pose0, height)
+    scale = scale_at_roof(target, flat.places, height_m=height, camera=used.pose0)
     measured = (status == Status.OK) | (status == Status.WEAK)
     moved = np.stack([fit.at(place, body.centre) for place in body.places], axis=1)
     at_rest = still & measured
@@ -236,13 +224,6 @@ def _solve_target(
         rotation_raw_rad=raw.rotation_rad,
     )
     return TargetSolution(history=history, rest_m=body.places + start_m + origin_m)
-
-
-def _paper_scale(target: Target, flat: RestBody, pose0: Pose, height_m: float) -> float:
-    """Return metres at roof level per plan metre: from the known distance P1-P2, or else from the heights."""
-    if target.p1_p2_m is not None and target.kind == "lines":
-        return target.p1_p2_m / float(np.linalg.norm(flat.places[0] - flat.places[1]))
-    return float((pose0.centre_m[2] - height_m) / pose0.centre_m[2])
 
 
 def _sigma_of_points(fit: RigidFit, body: RestBody) -> Sigma:

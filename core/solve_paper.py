@@ -9,7 +9,6 @@ import numpy as np
 
 from core.camera import intersect_height
 from core.coordinates import Bools, Floats, apply_homography, finite_rows
-from core.errors import InputError
 from core.georeference import ReferenceFit
 from core.ground import LEAST_POINTS, fit_homography
 from core.ground_poses import fit_with_relief
@@ -20,6 +19,7 @@ from core.motion import regress_lines
 from core.project import Project, Target
 from core.relief import Relief
 from core.results import TargetHistory
+from core.roof_level import refuse_if, scale_at_roof, scale_obstacle
 from core.solution import Ground, Solution, TargetSolution, frame_status
 from core.uncertainty import GROUND_PART, held_to_jitter
 
@@ -37,6 +37,8 @@ def solve_paper(
         InputError: the clicks do not do, or neither P1-P2 nor a height tells the scale at the roof.
     """
     reference = fit_with_relief(project, lens, relief, has_lens=has_lens)
+    for target in project.targets:
+        refuse_if(scale_obstacle(target, reference.pose, has_lens=has_lens), target)
     ground = stabilise(recording, lens, reference.H_plan_ray)
     targets = {target.name: _solve_target(recording, project, target, reference, ground) for target in project.targets}
     return Solution(
@@ -100,7 +102,7 @@ def _solve_target(
     lines = regress_lines(plan_points(raw.mean(axis=-2), lens, H))
     places = np.stack([lines.intersection(0, 2), lines.intersection(1, 2)], axis=1)
     spread = np.stack([lines.intersection_sigma(0, 2), lines.intersection_sigma(1, 2)], axis=1)
-    scale = _scale(target, reference, places[0])
+    scale = scale_at_roof(target, places[0], height_m=target.height_m, camera=reference.pose)
     moved = scale * (places[1:] - places[0])
     angle = np.arctan2(*np.moveaxis(places[:, 0] - places[:, 1], -1, 0)[::-1])
     turned = np.angle(np.exp(1j * (angle[1:] - angle[0])))
@@ -130,24 +132,6 @@ def _solve_target(
         rotation_raw_rad=turned,
     )
     return TargetSolution(history=history, rest_m=_rest(target, reference, places[0]) + reference.origin_m)
-
-
-def _scale(target: Target, reference: ReferenceFit, places: Floats) -> float:
-    """Return metres at roof level per plan metre, from the known distance P1-P2 or else from the heights.
-
-    Raises:
-        InputError: neither is known.
-
-    Source: the paper, Fig. 6(a).
-    """
-    if target.p1_p2_m is not None:
-        return target.p1_p2_m / float(np.linalg.norm(places[0] - places[1]))
-    if target.height_m is not None and reference.pose is not None:
-        return float(1.0 - target.height_m / reference.pose.centre_m[2])
-    raise InputError(
-        f'project.json: targets.{target.name}.p1_p2_m is missing; "paper" takes its scale from the known distance '
-        "P1–P2, or from height_m and a lens."
-    )
 
 
 def _rest(target: Target, reference: ReferenceFit, places: Floats) -> Floats:

@@ -52,6 +52,7 @@ ORDER = (
     "measure",
     "preview",
     "uncertainty",
+    "roof_level",
     "solution",
     "ground_poses",
     "calibration",

@@ -134,7 +134,7 @@ def test_two_lines_that_are_not_quite_parallel_fix_nothing(kept: int) -> None:
 def test_a_roof_above_the_camera_is_refused() -> None:
     document = scene.project_document()
     roof = {**document.targets[0].model_dump(by_alias=True), "height_m": 90.0}
-    with pytest.raises(InputError, match=r"height_m is 90, but by the clicks the camera hovers \d+\.\d m above"):
+    with pytest.raises(InputError, match=r"height_m: 90, but by the clicks the camera hovers \d+\.\d m above"):
         solved(scene.recording(), targets=[roof])
 
 

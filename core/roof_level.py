@@ -1,0 +1,78 @@
+"""What lifts the ground's metres to a target: its height above the ground, or the known distance P1–P2.
+
+An obstacle is said from the target's key in `project.json` on: what is wrong with it and what to do.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from core.camera import Pose
+from core.coordinates import Floats
+from core.errors import InputError
+from core.project import PROJECT_FILE, Target
+
+
+def height_obstacle(target: Target, camera: Pose | None) -> str | None:
+    """Return what keeps `geometric` from knowing a target's plane, or None.
+
+    Args:
+        camera: of the reference frame; None where the clicks do not tell it.
+    """
+    if target.height_m is None:
+        return f'height_m: missing, but method "geometric" needs the height of "{target.name}"; add it'
+    return _too_high(target.height_m, camera)
+
+
+def scale_obstacle(target: Target, camera: Pose | None, *, has_lens: bool) -> str | None:
+    """Return what keeps `paper` from knowing a target's scale, or None.
+
+    Args:
+        camera: as in `height_obstacle`.
+        has_lens: whether there is a lens, without which the clicks tell no camera.
+    """
+    if target.kind == "points":
+        return 'kind: "points", which method "paper" does not know; choose "geometric", or mark lines'
+    if target.p1_p2_m is None and (target.height_m is None or not has_lens):
+        return (
+            'p1_p2_m: missing; "paper" takes its scale from the known distance P1-P2, or from height_m and a lens; '
+            "add one of them"
+        )
+    return None if target.height_m is None else _too_high(target.height_m, camera)
+
+
+def _too_high(height_m: float, camera: Pose | None) -> str | None:
+    if camera is None or height_m < camera.centre_m[2]:
+        return None
+    return (
+        f"height_m: {height_m:g}, but by the clicks the camera hovers {camera.centre_m[2]:.1f} m above the ground; "
+        "correct the height, the clicks or the lens"
+    )
+
+
+def refuse_if(obstacle: str | None, target: Target) -> None:
+    """Refuse a target with an obstacle.
+
+    Raises:
+        InputError: naming the obstacle.
+    """
+    if obstacle is not None:
+        raise InputError(f"{PROJECT_FILE}: targets.{target.name}.{obstacle}.")
+
+
+def scale_at_roof(target: Target, places_m: Floats, *, height_m: float | None, camera: Pose | None) -> float:
+    """Return metres at roof level per plan metre: from the known distance P1–P2, or else from the heights.
+
+    Args:
+        target: that `scale_obstacle` or `height_obstacle` has nothing against.
+        places_m: (2, 2) P1 and P2 where they appear on the ground plane, plan metres.
+        height_m: of the target, as calibrated.
+        camera: of the reference frame.
+
+    Source: the paper, Fig. 6(a).
+    """
+    if target.p1_p2_m is not None and target.kind == "lines":
+        return target.p1_p2_m / float(np.linalg.norm(places_m[0] - places_m[1]))
+    assert height_m is not None
+    assert camera is not None
+    return float(1.0 - height_m / camera.centre_m[2])
