@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -63,13 +64,18 @@ class LoadedInputs:
     relief: Relief | None
     gps: GpsRecord | None
 
+    @cached_property
     def reference_fit(self) -> ReferenceFit:
-        """Return the fit of the clicks."""
+        """The fit of the clicks, made once.
+
+        Raises:
+            InputError: the clicks do not do.
+        """
         return fit_with_relief(self.project, self.lens, self.relief, has_lens=self.has_lens)
 
     def setup(self) -> MeasureSetup:
         """Return what the pass over the video needs."""
-        fit = self.reference_fit()
+        fit = self.reference_fit
         return MeasureSetup(
             video=self.video,
             reference_frame=self.project.reference_frame,
@@ -298,7 +304,7 @@ def _middle_of_targets(project: Project, otherwise: Floats) -> Floats:
 
 
 def _require_runnable(inputs: LoadedInputs) -> None:
-    for obstacle in obstacles(inputs.project, frame_index(inputs.video), inputs.reference_fit()):
+    for obstacle in obstacles(inputs.project, frame_index(inputs.video), inputs.reference_fit):
         raise InputError(f"{inputs.folder / PROJECT_FILE}: {obstacle}.")
 
 

@@ -34,7 +34,7 @@ class PublishedMethod:
     def __init__(self, inputs: LoadedInputs, reference: Luma) -> None:
         self._lens = inputs.lens
         self._allowed = ground_mask(reference.shape, inputs.project.moving_regions_px).astype(np.uint8)
-        fit = inputs.reference_fit()
+        fit = inputs.reference_fit
         H_plan_und = fit.H_plan_ray @ np.linalg.inv(self._lens.camera_matrix)
         self._raster = _Raster(reference.shape, H_plan_und, fit.origin_m)
         self._sift = cv2.SIFT.create()
