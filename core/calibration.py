@@ -28,6 +28,7 @@ from core.robust import finite_median, robust_sigma
 from core.row_times import ALIKE
 from core.self_calibration import Parameter, SelfCalibration, refused, self_calibrate
 from core.solution import Ground
+from core.uncertainty import robust_jitter
 
 # Moments at which corrections are tried, and the fewest that say anything.
 MOMENTS = 48
@@ -210,10 +211,10 @@ def _stationary_groups(parts: Sequence[Bools], usable: Bools) -> tuple[list[NDAr
 
 
 def _noise(motion: Floats) -> Floats:
-    """Return the noise (K,) of moments (B, K), from how unevenly they follow each other; boundless if they are few."""
+    """Return the noise (K,) of moments (B, K), metres; boundless if they are too few to tell."""
     if len(motion) < 3:
         return np.full(motion.shape[1], np.inf)
-    return np.maximum(robust_sigma(np.diff(motion, n=2, axis=0).T) / np.sqrt(6.0), LEAST_NOISE_M)
+    return np.maximum(robust_jitter(motion), LEAST_NOISE_M)
 
 
 @dataclass(frozen=True)

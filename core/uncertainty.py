@@ -13,7 +13,7 @@ from scipy.ndimage import uniform_filter1d
 
 from core.coordinates import Bools, Floats
 from core.results import TargetHistory
-from core.robust import BY_MEDIAN, finite_median
+from core.robust import BY_MEDIAN, finite_median, robust_sigma
 
 # What the ground errs by as a whole, as part of its features' scatter (measured on H.264 clips with exact truth).
 GROUND_PART = 0.05
@@ -27,6 +27,8 @@ LEAST_WANDERING = 0.7
 # An encoder predicts a moving roof worse than one at rest, and not all of that shows in its pieces: what was held
 # against the scatter at rest is widened by this where the roof moves (measured likewise: 2 sigma then hold 90 to 98 %).
 MOVING = 1.3
+# By how much a second difference a - 2 b + c scatters more than the values: the root of 1 + 4 + 1.
+SECOND_DIFFERENCE = np.sqrt(6.0)
 # Stationary frames from which the scatter at rest is believed.
 LEAST_STILL = 30
 # Bounds of the correction by the scatter at rest: beyond them something other than random error is at work.
@@ -112,7 +114,14 @@ def jitter(values: Floats) -> Floats:
     """Return the noise (...) of values (M, ...) in M frames, from how unevenly they follow each other; 0 of a few."""
     if len(values) < 3:
         return np.zeros(values.shape[1:])
-    return np.asarray(np.diff(values, n=2, axis=0).std(axis=0) / np.sqrt(6.0))
+    return np.asarray(np.diff(values, n=2, axis=0).std(axis=0) / SECOND_DIFFERENCE)
+
+
+def robust_jitter(values: Floats) -> Floats:
+    """Return the noise (...) of values (M, ...) as `jitter`, but outliers do not move it and nan are passed over."""
+    if len(values) < 3:
+        return np.zeros(values.shape[1:])
+    return robust_sigma(np.moveaxis(np.diff(values, n=2, axis=0), 0, -1)) / SECOND_DIFFERENCE
 
 
 def held_to_jitter(sigma: Floats, value: Floats, still: Bools) -> Floats:

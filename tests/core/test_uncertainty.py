@@ -14,6 +14,7 @@ from core.uncertainty import (
     held_to_jitter,
     held_to_scatter,
     jitter,
+    robust_jitter,
 )
 
 FRAMES = 400
@@ -55,6 +56,15 @@ def test_noise_is_told_from_drift() -> None:
     few = np.arange(FRAMES) < LEAST_STILL - 1
     np.testing.assert_array_equal(held_to_jitter(np.full((FRAMES, 2), 1e-5), noise, few), 1e-5)
     assert not jitter(noise[:2]).any()
+
+
+def test_outliers_and_gaps_are_not_taken_for_noise() -> None:
+    noise = np.random.default_rng(6).normal(scale=[3e-4, 6e-4], size=(FRAMES, 2))
+    torn = noise.copy()
+    torn[::40], torn[5::60] = 1.0, np.nan
+    np.testing.assert_allclose(robust_jitter(noise), jitter(noise), rtol=0.1)
+    np.testing.assert_allclose(robust_jitter(torn), jitter(noise), rtol=0.2)
+    assert not robust_jitter(noise[:2]).any()
 
 
 def test_error_bars_widen_where_the_roof_moves_and_not_after(places_m: Floats) -> None:
