@@ -59,12 +59,12 @@ class Cluster:
         self._client.close()
 
     def measure(
-        self, eyes: bytes, divide: Callable[[int], Sequence[Chunk]], frames: int
+        self, prepared: bytes, divide: Callable[[int], Sequence[Chunk]], frames: int
     ) -> Generator[FrameMeasurement, None, None]:
         """Yield the measurements of chunks as their tasks finish, frames of a chunk in order.
 
         Args:
-            eyes: what the tasks' work is done with.
+            prepared: as in `core.workers.Order`.
             divide: cuts what is to be measured into about so many chunks.
             frames: of the video.
         """
@@ -72,7 +72,7 @@ class Cluster:
 
         client = self._client
         chunks = divide(tasks_for(frames, sum(client.nthreads().values())))
-        futures = [client.submit(self._work, eyes, chunk, pure=False, retries=RETRIES) for chunk in chunks]
+        futures = [client.submit(self._work, prepared, chunk, pure=False, retries=RETRIES) for chunk in chunks]
         try:
             # Its loop must be named: this client is nobody's default.
             for future in as_completed(futures, loop=client.loop):

@@ -51,26 +51,26 @@ def make_measurer(
     setup: MeasureSetup,
     reference: Reference | None = None,
     index: FrameIndex | None = None,
-    begun: FramesAhead | None = None,
+    decoding: FramesAhead | None = None,
 ) -> Measurer:
-    """Return the measurer of the setup's method, its eyes on the reference frame.
+    """Return the measurer of the setup's method, which has looked at the reference frame.
 
     Args:
         reference: of an earlier recording, to go on with exactly its features; chosen anew where None.
         index: of the video, where it is known already.
-        begun: frames of which none is taken yet, where decoding has begun; if with the reference frame, it need not be
-            decoded twice.
+        decoding: frames being decoded of which none is taken yet; if with the reference frame, it need not be decoded
+            twice.
 
     Raises:
         InputError: the video or its reference frame cannot be read, or that shows nothing to hold on to.
     """
     first = setup.reference_frame
     with ExitStack() as stack:
-        if begun is None or begun.start != first:
+        if decoding is None or decoding.start != first:
             cores = available_cores()
             stop = first + 1 + JUDGED_BY
-            begun = stack.enter_context(FramesAhead(setup.video, first, stop, threads=cores, index=index))
-        frames = begun.peek()
+            decoding = stack.enter_context(FramesAhead(setup.video, first, stop, threads=cores, index=index))
+        frames = decoding.peek()
         frame = next(frames, None)
         if frame is None or frame.index != first:
             raise InputError(f"{setup.video}: frame {first} cannot be decoded; choose another reference_frame.")
@@ -151,7 +151,7 @@ def measure_chunk(
     before: Sequence[FrameMeasurement] = (),
     threads: int = 0,
     index: FrameIndex | None = None,
-    begun: FramesAhead | None = None,
+    decoding: FramesAhead | None = None,
 ) -> Iterator[FrameMeasurement]:
     """Yield the measurements of a chunk's frames in order; in one that cannot be decoded nothing is measured.
 
@@ -159,12 +159,12 @@ def measure_chunk(
         before: the last two frames before the chunk, where known; otherwise the chunk finds its own way in.
         threads: decoder threads, as `FramesAhead`.
         index: of the video, where it is known already.
-        begun: frames from the chunk's first on, where decoding them has begun already.
+        decoding: frames being decoded already, from the chunk's first on.
     """
     index = index or frame_index(setup.video)
     first = chunk.start if before else max(0, chunk.start - WARM_UP)
     history = list(before)[-2:]
-    with begun or FramesAhead(setup.video, first, chunk.stop, threads=threads, index=index) as frames:
+    with decoding or FramesAhead(setup.video, first, chunk.stop, threads=threads, index=index) as frames:
         for number, frame in _numbered(frames, first, chunk.stop):
             time_s = index.time_s_of(number)
             if frame is None:
@@ -217,7 +217,7 @@ def measure(
         # While timestamps and reference frame are still looked at, others load and the first chunk is being decoded.
         cluster = stack.enter_context(Cluster(measure_remotely, scheduler)) if scheduler is not None else None
         is_new = recording is None and cluster is None
-        begun = stack.enter_context(FramesAhead(setup.video, threads=min(workers - 1, 1))) if is_new else None
+        decoding = stack.enter_context(FramesAhead(setup.video, threads=min(workers - 1, 1))) if is_new else None
         index = frame_index(setup.video)
         done = [] if recording is None else store.measured_frames(recording)
         chunks = missing_chunks(done, index, workers, HEAD_START) if cluster is None else []
@@ -225,10 +225,10 @@ def measure(
         helping = max(0, min(workers, len(chunks)) - 1)
         helpers = stack.enter_context(Helpers(measure_order, helping))
         reference = None if recording is None else store.reference(recording)
-        measurer = make_measurer(setup, reference, index, begun)
+        measurer = make_measurer(setup, reference, index, decoding)
         if recording is None:
             recording = store.begin(setup.method, setup.fingerprint, measurer.reference)
-        eyes = pickle.dumps(Eyes(setup, index, measurer))
+        prepared = pickle.dumps(PreparedVideo(setup, index, measurer))
 
         def own(order: Order) -> Iterator[FrameMeasurement]:
             return measure_chunk(
@@ -238,14 +238,14 @@ def measure(
                 before=order.before,
                 threads=min(helping, 1),
                 index=index,
-                begun=begun if order.chunk == chunks[0] else None,
+                decoding=decoding if order.chunk == chunks[0] else None,
             )
 
         if cluster is None:
-            orders = [Order(eyes, chunk, known) for chunk, known in zip(chunks, before, strict=True)]
+            orders = [Order(prepared, chunk, known) for chunk, known in zip(chunks, before, strict=True)]
             source = helpers.measure(orders, own)
         else:
-            source = cluster.measure(eyes, lambda parts: missing_chunks(done, index, parts), len(index))
+            source = cluster.measure(prepared, lambda parts: missing_chunks(done, index, parts), len(index))
         _take_over(source, store, recording, done=len(done), total=len(index), progress=progress, cancel=cancel)
     store.finish(recording)
     return recording
@@ -283,7 +283,7 @@ def _before(store: MeasurementStore, recording: int | None, start: int) -> list[
 
 
 @dataclass(frozen=True)
-class Eyes:
+class PreparedVideo:
     """What all chunks of a video have in common, sent to whoever measures them; they need no reference frame then."""
 
     setup: MeasureSetup
@@ -292,10 +292,10 @@ class Eyes:
 
 
 class _Kept(threading.local):
-    """The eyes a worker used last, opened: the next chunk is mostly of the same video."""
+    """What a worker unpacked last: the next chunk is mostly of the same video."""
 
     packed = b""
-    eyes: Eyes
+    prepared: PreparedVideo
 
 
 _kept = _Kept()
@@ -305,19 +305,19 @@ def measure_order(order: Order) -> Iterator[FrameMeasurement]:
     """Yield the measurements of one chunk; runs in a helping process or on a worker, on one core."""
     # Libraries that start threads of their own would only get in each other's way.
     cv2.setNumThreads(1)
-    if _kept.packed != order.eyes:
-        _kept.eyes = pickle.loads(order.eyes)
-        _kept.packed = order.eyes
+    if _kept.packed != order.prepared:
+        _kept.prepared = pickle.loads(order.prepared)
+        _kept.packed = order.prepared
     yield from measure_chunk(
-        _kept.eyes.setup,
+        _kept.prepared.setup,
         order.chunk,
-        measurer=_kept.eyes.measurer,
+        measurer=_kept.prepared.measurer,
         before=order.before,
         threads=1,
-        index=_kept.eyes.index,
+        index=_kept.prepared.index,
     )
 
 
-def measure_remotely(eyes: bytes, chunk: Chunk) -> list[FrameMeasurement]:
+def measure_remotely(prepared: bytes, chunk: Chunk) -> list[FrameMeasurement]:
     """Return the measurements of one chunk; runs on a worker."""
-    return list(measure_order(Order(eyes, chunk)))
+    return list(measure_order(Order(prepared, chunk)))

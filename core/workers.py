@@ -24,11 +24,11 @@ class Order:
     """A chunk to be measured.
 
     Attributes:
-        eyes: what to look at and what to look for, packed; the same for all chunks of a video.
+        prepared: a `PreparedVideo` of `core.measure`, packed; the same for all chunks of a video.
         before: the last two frames before the chunk, where known.
     """
 
-    eyes: bytes
+    prepared: bytes
     chunk: Chunk
     before: Sequence[FrameMeasurement] = ()
 

@@ -34,7 +34,7 @@ import numpy as np
 from core.chunks import WARM_UP, Chunk
 from core.following import LinesFollower
 from core.ground import GroundTracker
-from core.measure import Eyes, make_measurer, measure, measure_chunk, measure_order
+from core.measure import PreparedVideo, make_measurer, measure, measure_chunk, measure_order
 from core.measurements import MeasurementStore
 from core.run import FRAMES_FILE, load_inputs, run_project
 from core.solve import solve
@@ -260,28 +260,28 @@ def costs(folder: Path, count: int) -> dict[str, Any]:
         total = sum(1 for _ in read_frames(inputs.video, threads=1))
     with _core_seconds() as looking:
         measurer = make_measurer(setup)
-    eyes = pickle.dumps(Eyes(setup, index, measurer))
+    prepared = pickle.dumps(PreparedVideo(setup, index, measurer))
     first = index.key_frames[-1] + WARM_UP
     with _core_seconds() as beginning:
-        list(measure_order(Order(eyes, Chunk(first, first + 1))))
+        list(measure_order(Order(prepared, Chunk(first, first + 1))))
     with _core_seconds() as measuring:
-        found = list(measure_order(Order(eyes, Chunk(0, total))))
+        found = list(measure_order(Order(prepared, Chunk(0, total))))
     run_project(folder)
     with _core_seconds() as writing:
         run_project(folder)
     with _dask() as cluster, Client(cluster) as client:
         started = time.perf_counter()
-        client.gather(client.map(len, [eyes] * EMPTY_TASKS, pure=False))
+        client.gather(client.map(len, [prepared] * EMPTY_TASKS, pure=False))
         empty_ms = (time.perf_counter() - started) / EMPTY_TASKS * 1e3
     return {
         "frame_ms": measuring[0] / total * 1e3,
         "decode_ms": decoding[0] / total * 1e3,
-        "eyes_s": looking[0],
+        "reference_s": looking[0],
         "begin_s": beginning[0],
         "solve_and_write_s": writing[0],
         "empty_task_ms": empty_ms,
         "video_bytes": state_of(inputs.video).size / total,
-        "task_bytes": len(eyes),
+        "task_bytes": len(prepared),
         "result_bytes": len(pickle.dumps(found)) / total,
         "stored_bytes": (folder / "results" / FRAMES_FILE).stat().st_size / total,
     }
