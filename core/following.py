@@ -145,7 +145,20 @@ def _scale(plan_m: Floats, to_ray0: Callable[[Floats], Floats], lens: Lens) -> S
 
 
 class LinesFollower:
-    """Follows L1, L2 and T1 of a target together."""
+    """Follows L1, L2 and T1 of a target together.
+
+    Args:
+        luma: the reference frame, (height, width).
+        ends: (3, 2, 2) both ends of each band's axis, rays of the reference frame.
+        widths_px: full width of each band, raw pixels.
+        names: of the bands, for messages.
+
+    Attributes:
+        reference_raw: (3, STATIONS, 2, 2) edges in the reference frame, raw pixels; nan where not found.
+
+    Raises:
+        InputError: a band leaves the frame or shows no line.
+    """
 
     def __init__(
         self, luma: Luma, ends: Floats, lens: Lens, *, widths_px: list[float], scale: Scale, names: list[str]
@@ -211,7 +224,19 @@ class LinesFollower:
 
 
 class PointsFollower:
-    """Follows a textured target by patches spread over its region."""
+    """Follows a textured target by patches spread over its region.
+
+    Args:
+        luma: the reference frame, (height, width).
+        region: (M, 2) its corners, rays of the reference frame.
+        name: of the target, for messages.
+
+    Attributes:
+        reference_raw: (N, 2) centres of the patches in the reference frame, raw pixels.
+
+    Raises:
+        InputError: the region shows too little texture.
+    """
 
     def __init__(self, luma: Luma, region: Floats, lens: Lens, *, scale: Scale, name: str) -> None:
         self._lens = lens
@@ -304,6 +329,10 @@ class TargetFinder:
     """Recognises a whole target by its picture, wherever it has moved.
 
     Hatches, cables and corners tell apart what equal strips do not.
+
+    Args:
+        luma: the reference frame, (height, width).
+        outline: (M, 2) places that bound the target, rays of the reference frame.
     """
 
     def __init__(self, luma: Luma, outline: Floats, lens: Lens, scale: Scale) -> None:

@@ -298,6 +298,10 @@ class CameraFinder:
     """Recognises the ground without a prediction: after a cut, at the start of a chunk, after a gust.
 
     SIFT on pictures reduced to about a quarter; it serves only until the patches take over.
+
+    Args:
+        luma: the reference frame, (height, width).
+        allowed: (height, width) bool, where there is ground.
     """
 
     def __init__(self, luma: Luma, lens: Lens, allowed: NDArray[np.bool_]) -> None:

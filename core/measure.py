@@ -98,7 +98,18 @@ class Patched(Protocol):
 
 
 class GeometricMeasurer:
-    """Patches on the ground, strips or patches on the targets; see `core.ground` and `core.following`."""
+    """Patches on the ground, strips or patches on the targets; see `core.ground` and `core.following`.
+
+    Args:
+        luma: the reference frame, (height, width).
+        reference: of an earlier recording, whose ground features are taken; chosen anew where None.
+
+    Attributes:
+        reference: where the features are in the reference frame, raw pixels.
+
+    Raises:
+        InputError: the frame shows too little ground, or no line or texture where a target should be.
+    """
 
     def __init__(self, luma: Luma, setup: MeasureSetup, reference: Reference | None = None) -> None:
         points = choose_features(luma, setup.moving_regions_px, FEATURES) if reference is None else reference.ground_raw

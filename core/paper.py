@@ -60,7 +60,17 @@ _Edge = tuple[float, float]
 
 
 class PaperMeasurer:
-    """Measures frames the published way; see `core.measure.Measurer`."""
+    """Measures frames the published way; see `core.measure.Measurer`.
+
+    Args:
+        luma: the reference frame, (height, width).
+
+    Attributes:
+        reference: where the features are in the reference frame, raw pixels.
+
+    Raises:
+        InputError: the frame shows too little ground, or no line where a target should be, or a target has no lines.
+    """
 
     def __init__(self, luma: Luma, setup: MeasureSetup) -> None:
         allowed = ground_mask(luma.shape, setup.moving_regions_px)
@@ -83,7 +93,18 @@ class PaperMeasurer:
 
 
 class SiftGround:
-    """SIFT features of the reference frame's ground, matched in other frames."""
+    """SIFT features of the reference frame's ground, matched in other frames.
+
+    Args:
+        luma: the reference frame, (height, width).
+        allowed: (height, width) bool, where there is ground.
+
+    Attributes:
+        points_raw: (N, 2) of the features in the reference frame, raw pixels.
+
+    Raises:
+        InputError: too few features are found.
+    """
 
     def __init__(self, luma: Luma, lens: Lens, allowed: NDArray[np.bool_]) -> None:
         self._lens = lens
@@ -225,7 +246,19 @@ def _mosaic(windows: list[Luma], columns: int) -> Luma:
 
 
 class CannyLines:
-    """L1, L2 and T1 of a target by Canny edge pairs on the orthorectified bands."""
+    """L1, L2 and T1 of a target by Canny edge pairs on the orthorectified bands.
+
+    Args:
+        luma: the reference frame, (height, width).
+        bands: L1, L2 and T1.
+        name: of the target, for messages.
+
+    Attributes:
+        reference_raw: (3, STATIONS, 2, 2) edges in the reference frame, raw pixels; nan where not found.
+
+    Raises:
+        InputError: a band shows no line.
+    """
 
     def __init__(self, luma: Luma, bands: list[Band], setup: MeasureSetup, name: str) -> None:
         self._lens = setup.lens
