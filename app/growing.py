@@ -9,9 +9,10 @@ from __future__ import annotations
 import logging
 import threading
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from app.errors import ApiError
+from app.events import Hub
 from app.jobs import Job
 from app.outcome import loaded, wanted_fingerprint
 from app.store import ProjectFolder
@@ -21,9 +22,6 @@ from core.project import Drift, Intervals, Project
 from core.results import TargetHistory, plain
 from core.run import FRAMES_FILE, LoadedInputs
 from core.solve import solve
-
-if TYPE_CHECKING:
-    from app.context import Context
 
 _PAUSE_S = 1.0
 # Fewer new frames are not worth a solve of their own.
@@ -52,13 +50,13 @@ class Growing:
         growth = self._growths.get(project_id)
         return {name: list(rows) for name, rows in growth.rows.items()} if growth else {}
 
-    def follow(self, here: Context, folder: ProjectFolder, job: Job) -> None:
+    def follow(self, hub: Hub, folder: ProjectFolder, job: Job) -> None:
         """Follow a job until it ends, telling the tabs of new rows."""
         growth = self._growths[folder.id] = _Growth()
-        args = (here, folder, job, growth)
+        args = (hub, folder, job, growth)
         threading.Thread(target=self._follow, args=args, name="growing", daemon=True).start()
 
-    def _follow(self, here: Context, folder: ProjectFolder, job: Job, growth: _Growth) -> None:
+    def _follow(self, hub: Hub, folder: ProjectFolder, job: Job, growth: _Growth) -> None:
         wait = threading.Event()
         inputs: LoadedInputs | None = None
         while job.is_running:
@@ -66,12 +64,12 @@ class Growing:
             try:
                 if inputs is None:
                     inputs = loaded(folder, folder.load().project)
-                _look(here, folder, inputs, growth)
+                _look(hub, folder, inputs, growth)
             except (ApiError, InputError) as error:
                 log.debug("no preview of %s yet: %s", folder.id, error)
 
 
-def _look(here: Context, folder: ProjectFolder, inputs: LoadedInputs, growth: _Growth) -> None:
+def _look(hub: Hub, folder: ProjectFolder, inputs: LoadedInputs, growth: _Growth) -> None:
     file = folder.results / FRAMES_FILE
     if not file.is_file():
         return
@@ -87,7 +85,7 @@ def _look(here: Context, folder: ProjectFolder, inputs: LoadedInputs, growth: _G
     for name, history in solution.histories.items():
         rows = rows_of(history)
         growth.rows.setdefault(name, []).extend(rows)
-        here.hub.publish(folder.id, "track", {"target": name, "rows": rows})
+        hub.publish(folder.id, "track", {"target": name, "rows": rows})
 
 
 def _plain(project: Project) -> Project:

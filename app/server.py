@@ -109,7 +109,7 @@ def _tidy_project(context: Context, folder: ProjectFolder) -> None:
     folder.remove_parts()
     job = context.jobs.go_on(folder, results.finish_track(context))
     if job is not None:
-        context.growing.follow(context, folder, job)
+        context.growing.follow(context.hub, folder, job)
 
 
 def _stop(context: Context) -> None:

@@ -44,7 +44,7 @@ def track(folder: Folder, here: Here, wanted: Start | None = None) -> dict[str, 
     """Measure what is missing and make all results, in a job; goes on where an earlier one stopped."""
     folder.load()
     job = here.jobs.start(folder, "track", {"fresh": bool(wanted and wanted.fresh)}, finish_track(here))
-    here.growing.follow(here, folder, job)
+    here.growing.follow(here.hub, folder, job)
     return {"job": job.as_json()}
 
 
