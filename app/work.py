@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from app import calibrations, orthoimages, sites
-from app.worker import Reporter
+from app.reporter import Reporter
 from core.progress import CancelToken
 from core.run import run_project
 
