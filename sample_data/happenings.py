@@ -7,19 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sample_data import painting
+from sample_data.brief import Brief
 from sample_data.flight import Gust
 from sample_data.scene import Measured, Plate, RoofLines, Scene
 from sample_data.shaking import Motion
 from sample_data.textures import Texture
-
-if TYPE_CHECKING:
-    from sample_data.catalogue import Brief
 
 Floats = NDArray[np.float64]
 Rng = np.random.Generator
