@@ -24,7 +24,7 @@ from core.measurements import Recording
 from core.motion import RigidFit
 from core.project import Project, Target
 from core.relief import Relief
-from core.results import Status, TargetHistory
+from core.results import MEASURED, TargetHistory
 from core.roof_level import height_obstacle, refuse_if, scale_at_roof
 from core.row_times import Readout, at_frame_times, estimated_readout, ground_speed
 from core.self_calibration import SelfCalibration
@@ -72,8 +72,8 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
             recording,
             project,
             target,
-            used,
-            ground,
+            used=used,
+            ground=ground,
             flight=flight,
             slow_m=slow_m[target.name],
             origin_m=reference.origin_m,
@@ -169,45 +169,35 @@ def _solve_target(
     recording: Recording,
     project: Project,
     target: Target,
+    *,
     used: Calibration,
     ground: Ground,
-    *,
     flight: SmoothFlight | None,
     slow_m: Floats,
     origin_m: Floats,
 ) -> TargetSolution:
-    height = used.heights_m[target.name]
-    body = rest_body(recording, target.name, used.lens, used.pose0, height)
-    points = world_points(midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, height)
+    body, points = _on_plane(recording, target, used, ground, z_m=used.heights_m[target.name])
     still = during(recording.time_s, project.intervals_s.pre_event)
     fit = body.fit(points, still & ground.usable)
     used_points = (fit.weight > 0.1).reshape(len(fit.weight), -1).sum(axis=1)
     status = frame_status(recording, project, ground, used_points, body.is_determined(fit))
-    apparent = world_points(midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, 0.0)
-    flat = rest_body(recording, target.name, used.lens, used.pose0, 0.0)
-    raw = flat.fit(apparent, np.zeros(len(apparent), dtype=bool))
-    scale = scale_at_roof(target, flat.places, height_m=height, camera=used.pose0)
-    measured = (status == Status.OK) | (status == Status.WEAK)
+    at_rest = still & np.isin(status, MEASURED)
     moved = np.stack([fit.at(place, body.centre) for place in body.places], axis=1)
-    at_rest = still & measured
     start_m, start_rad = (
         (moved[at_rest].mean(axis=0), fit.rotation_rad[at_rest].mean()) if at_rest.any() else (np.zeros((2, 2)), 0.0)
     )
     places, rotation = moved - start_m, fit.rotation_rad - start_rad
-    part = height / used.pose0.centre_m[2]
-    pixel_m = (used.pose0.centre_m[2] - height) / float(used.lens.focal_px.mean())
-    frames = len(recording.frame)
-    common_m = common_error(fit.residual, recording.time_s, at_rest)
     sigma = combined_sigma(
         _sigma_of_points(fit, body),
-        camera_m=np.zeros((frames, 2)) if flight is None else part * flight.sigma_m[:, :2],
-        shared_m=np.hypot(GROUND_PART * ground.rms_px * pixel_m, common_m),
+        camera_m=_camera_part(target, used, flight, frames=len(recording.frame)),
+        shared_m=np.hypot(_ground_part(target, used, ground), common_error(fit.residual, recording.time_s, at_rest)),
         slow_m=slow_m,
         places_m=places,
         rotation_rad=rotation,
         still=at_rest,
         moving=~(still | during(recording.time_s, project.intervals_s.residual)),
     )
+    raw_m, raw_rad = _without_parallax_correction(recording, target, used, ground)
     history = TargetHistory(
         name=target.name,
         frame=recording.frame,
@@ -219,11 +209,42 @@ def _solve_target(
         p1_sigma_m=sigma.places_m[:, 0],
         p2_sigma_m=sigma.places_m[:, 1],
         rotation_sigma_rad=sigma.rotation_rad,
-        p1_raw_m=scale * raw.at(flat.places[0], flat.centre),
-        p2_raw_m=scale * raw.at(flat.places[1], flat.centre),
-        rotation_raw_rad=raw.rotation_rad,
+        p1_raw_m=raw_m[:, 0],
+        p2_raw_m=raw_m[:, 1],
+        rotation_raw_rad=raw_rad,
     )
     return TargetSolution(history=history, rest_m=body.places + start_m + origin_m)
+
+
+def _on_plane(
+    recording: Recording, target: Target, used: Calibration, ground: Ground, *, z_m: float
+) -> tuple[RestBody, Floats]:
+    """Return a target at rest on the plane z, and its points (F, L, S, 2) or (F, N, 2) there in every frame, metres."""
+    body = rest_body(recording, target.name, used.lens, used.pose0, z_m)
+    return body, world_points(midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, z_m)
+
+
+def _without_parallax_correction(
+    recording: Recording, target: Target, used: Calibration, ground: Ground
+) -> tuple[Floats, Floats]:
+    """Return P1 and P2 (F, 2, 2), metres, and the rotation (F,) as a homography of the ground alone would show them."""
+    flat, apparent = _on_plane(recording, target, used, ground, z_m=0.0)
+    fit = flat.fit(apparent, np.zeros(len(apparent), dtype=bool))
+    scale = scale_at_roof(target, flat.places, height_m=used.heights_m[target.name], camera=used.pose0)
+    return scale * np.stack([fit.at(place, flat.centre) for place in flat.places], axis=1), fit.rotation_rad
+
+
+def _camera_part(target: Target, used: Calibration, flight: SmoothFlight | None, *, frames: int) -> Floats:
+    """Return what the noise left in the camera's path moves a target by, (F, 2) metres."""
+    if flight is None:
+        return np.zeros((frames, 2))
+    return np.asarray(used.heights_m[target.name] / used.pose0.centre_m[2] * flight.sigma_m[:, :2])
+
+
+def _ground_part(target: Target, used: Calibration, ground: Ground) -> Floats:
+    """Return what the ground errs by as a whole, (F,) metres at a target's height."""
+    pixel_m = (used.pose0.centre_m[2] - used.heights_m[target.name]) / float(used.lens.focal_px.mean())
+    return np.asarray(GROUND_PART * ground.rms_px * pixel_m)
 
 
 def _sigma_of_points(fit: RigidFit, body: RestBody) -> Sigma:
