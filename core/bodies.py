@@ -105,7 +105,7 @@ def midpoints(raw: Floats) -> Floats:
     return raw.mean(axis=-2) if raw.ndim == 5 else raw
 
 
-def rest_body(recording: Recording, name: str, lens: Lens, pose0: Pose, z_m: float) -> RestBody:
+def rest_body(recording: Recording, name: str, *, lens: Lens, pose0: Pose, z_m: float) -> RestBody:
     """Return a target as it lies in the reference frame, on the plane z.
 
     P1 and P2 are L1 and L2 met by T1; of a points target, the ends of its region's longer axis.

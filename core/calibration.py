@@ -86,6 +86,7 @@ class Evidence:
     def of(
         cls,
         recording: Recording,
+        *,
         speed: Floats,
         project: Project,
         start: Calibration,
@@ -94,7 +95,9 @@ class Evidence:
     ) -> Evidence:
         """Return the evidence a recording holds; `speed` as `core.row_times.ground_speed`."""
         frame0 = project.reference_frame
-        ground = solve_ground(recording, start.lens, start.pose0, reference.origin_m, relief, reference_frame=frame0)
+        ground = solve_ground(
+            recording, start.lens, start.pose0, origin_m=reference.origin_m, relief=relief, reference_frame=frame0
+        )
         return cls(recording, speed, project, start, reference, relief, ground)
 
     @cached_property
@@ -162,7 +165,9 @@ class Evidence:
         lens = replace(start.lens, camera_matrix=K, distortion=d)
         shift = start.shift_m + np.append(by["shift_m"], 0.0)
         clicks = self.project.correspondences
-        pose0 = reference_pose(clicks, lens, self.reference.origin_m, self._elevation, shift)
+        pose0 = reference_pose(
+            clicks, lens, origin_m=self.reference.origin_m, elevation_m=self._elevation, shift_m=shift
+        )
         return Calibration(lens, pose0, heights, start.lag_s + float(by["lag_s"][0]), shift)
 
 
@@ -245,7 +250,7 @@ class _Trials:
         evidence, raw = self._evidence, self._frames.reference.ground_raw
         used = evidence.corrected(correction)
         origin_m, relief = evidence.reference.origin_m, evidence.relief
-        points = ground_points(raw, used.lens, used.pose0, origin_m, relief)
+        points = ground_points(raw, used.lens, used.pose0, origin_m=origin_m, relief=relief)
         rays = used.lens.rays_from_raw(self._frames.ground_raw + used.lag_s * self._speed)
         poses = fit_poses(rays, self._start.weight, points, self._start, iterations=TRIAL_ITERATIONS, robust=False)
         return _Trial(used, poses)
@@ -256,7 +261,7 @@ class _Trials:
         columns = []
         for target in self._evidence.project.targets:
             height = trial.used.heights_m[target.name]
-            body = rest_body(self._frames, target.name, trial.used.lens, trial.used.pose0, height)
+            body = rest_body(self._frames, target.name, lens=trial.used.lens, pose0=trial.used.pose0, z_m=height)
             fit = body.fit_with(self._points(target, trial.used.lens, trial.poses, height), self._weight[target.name])
             p1, p2 = (fit.at(place, body.centre) for place in body.places)
             measured = is_determined(fit.normal)[:, None]
@@ -266,7 +271,7 @@ class _Trials:
     def _target_weight(self, target: Target) -> Floats:
         start = self._evidence.start
         height = start.heights_m[target.name]
-        body = rest_body(self._frames, target.name, start.lens, start.pose0, height)
+        body = rest_body(self._frames, target.name, lens=start.lens, pose0=start.pose0, z_m=height)
         fit = body.fit(self._points(target, start.lens, self._start, height), np.zeros(len(self._frames.frame), bool))
         sigma = np.maximum(finite_median(fit.sigma.T), 1e-6)
         return fit.weight / (sigma[:, None] if body.lines is not None else sigma) ** 2
@@ -317,7 +322,9 @@ def distance_misfit(evidence: Evidence) -> Callable[[Floats], Floats]:
     def missed_by(correction: Floats) -> Floats:
         used = evidence.corrected(correction)
         bodies = [
-            rest_body(evidence.recording, target.name, used.lens, used.pose0, used.heights_m[target.name])
+            rest_body(
+                evidence.recording, target.name, lens=used.lens, pose0=used.pose0, z_m=used.heights_m[target.name]
+            )
             for target in known
         ]
         measured_m = np.array([np.linalg.norm(body.places[0] - body.places[1]) for body in bodies])
@@ -345,12 +352,14 @@ def calibration_sigma(evidence: Evidence, calibration: SelfCalibration) -> dict[
     still = during(recording.time_s, evidence.project.intervals_s.pre_event)[chosen]
     moments_s = recording.time_s[chosen]
     return {
-        target.name: _sigma_from_rest(J[:, number], calibration.covariance, still, moments_s, recording.time_s)
+        target.name: _sigma_from_rest(
+            J[:, number], calibration.covariance, still=still, moments_s=moments_s, time_s=recording.time_s
+        )
         for number, target in enumerate(targets)
     }
 
 
-def _sigma_from_rest(J: Floats, covariance: Floats, still: Bools, moments_s: Floats, time_s: Floats) -> Floats:
+def _sigma_from_rest(J: Floats, covariance: Floats, *, still: Bools, moments_s: Floats, time_s: Floats) -> Floats:
     """Return what an uncertain calibration moves P1 and P2 by from rest, (F, 2, 2); nan where no moment tells.
 
     Args:

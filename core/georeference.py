@@ -168,9 +168,9 @@ def fit_reference(
     height = np.zeros(len(pairs)) if elevation_m is None else np.nan_to_num(elevation_m)
     points = np.column_stack([local, height])
     model = _fit(rays[enabled], points[enabled], has_lens)
-    left_out = _left_out(rays, points, enabled, lens, model)
+    left_out = _left_out(rays, points, enabled=enabled, lens=lens, model=model)
     residuals = tuple(
-        _pair_residual(pair, ray, point, model, lens, origin, out)
+        _pair_residual(pair, ray, point, model=model, lens=lens, origin=origin, left_out=out)
         for pair, ray, point, out in zip(pairs, rays, points, left_out, strict=True)
     )
     used = [pair for pair in residuals if pair.enabled]
@@ -191,6 +191,7 @@ def fit_reference(
 def reference_pose(
     pairs: Sequence[Correspondence],
     lens: Lens,
+    *,
     origin_m: Floats,
     elevation_m: Floats | None,
     shift_m: Floats | None = None,
@@ -346,7 +347,7 @@ def _normalising(points: Floats) -> Floats:
 
 
 def _left_out(
-    rays: Floats, points: Floats, enabled: np.ndarray, lens: Lens, model: _Model
+    rays: Floats, points: Floats, *, enabled: np.ndarray, lens: Lens, model: _Model
 ) -> list[tuple[float, float] | None]:
     """Return each pair's size of residual, pixels and metres, against the fit of the others; None where none is."""
     others = enabled & ~np.eye(len(rays), dtype=bool)
@@ -396,6 +397,7 @@ def _pair_residual(
     pair: Correspondence,
     ray: Floats,
     point: Floats,
+    *,
     model: _Model,
     lens: Lens,
     origin: Floats,

@@ -50,7 +50,7 @@ def fit_with_relief(project: Project, lens: Lens, relief: Relief | None, *, has_
     return fit_reference(project.correspondences, lens, has_lens=has_lens, elevation_m=elevation)
 
 
-def ground_points(raw: Floats, lens: Lens, pose0: Pose, origin_m: Floats, relief: Relief | None) -> Floats:
+def ground_points(raw: Floats, lens: Lens, pose0: Pose, *, origin_m: Floats, relief: Relief | None) -> Floats:
     """Return the world coordinates (N, 3) of ground features seen at raw reference pixels (N, 2)."""
     rays = lens.rays_from_raw(raw)
     xy = intersect_height(pose0.R, pose0.centre_m, rays, 0.0)
@@ -62,7 +62,7 @@ def ground_points(raw: Floats, lens: Lens, pose0: Pose, origin_m: Floats, relief
     return np.column_stack([xy, z])
 
 
-def _on_ground(raw: Floats, lens: Lens, pose0: Pose, origin_m: Floats, relief: Relief | None) -> Bools:
+def _on_ground(raw: Floats, lens: Lens, pose0: Pose, *, origin_m: Floats, relief: Relief | None) -> Bools:
     """Return which features (N,) seen at raw reference pixels (N, 2) show the ground and nothing that stands on it."""
     if relief is None:
         return np.ones(len(raw), dtype=bool)
@@ -76,9 +76,9 @@ def solve_ground(
     recording: Recording,
     lens: Lens,
     pose0: Pose,
+    *,
     origin_m: Floats,
     relief: Relief | None,
-    *,
     reference_frame: int | None = None,
 ) -> Ground:
     """Return the pose of every frame from the ground features.
@@ -86,15 +86,15 @@ def solve_ground(
     Args:
         reference_frame: the only one in which the features may all lie where the reference frame shows them.
     """
-    points = ground_points(recording.reference.ground_raw, lens, pose0, origin_m, relief)
+    points = ground_points(recording.reference.ground_raw, lens, pose0, origin_m=origin_m, relief=relief)
     rays = lens.rays_from_raw(recording.ground_raw)
-    on_ground = _on_ground(recording.reference.ground_raw, lens, pose0, origin_m, relief)
+    on_ground = _on_ground(recording.reference.ground_raw, lens, pose0, origin_m=origin_m, relief=relief)
     weight = on_ground * np.ones(len(rays))[:, None]
     focal = float(lens.focal_px.mean())
     least = LEAST_SIGMA_PX / focal
     poses = fit_poses(rays, weight, points, pose0, sigma_floor=least)
     trusted = weight * _trust(poses)
-    trusted *= ~_standing(rays, trusted, points, poses, pose0, least)
+    trusted *= ~_standing(rays, trusted, points, poses, pose0=pose0, least_sigma=least)
     poses = fit_poses(rays, trusted, points, poses, iterations=4, sigma_floor=least)
     agreeing = np.where(trusted > 0, poses.weight / np.maximum(trusted, 1e-300), 0.0)
     inlier = agreeing > 0.1
@@ -124,7 +124,9 @@ def _change_px(ground_raw: Floats, frames: NDArray[np.int64]) -> Floats:
     return robust_sigma((moved - finite_median(moved)[..., None]).reshape(len(frames), -1))
 
 
-def _standing(rays: Floats, weight: Floats, points_m: Floats, poses: PoseFit, pose0: Pose, least_sigma: float) -> Bools:
+def _standing(
+    rays: Floats, weight: Floats, points_m: Floats, poses: PoseFit, *, pose0: Pose, least_sigma: float
+) -> Bools:
     """Return which ground features (N,) move, wherever the camera does, like something high above the ground.
 
     A car that came after the scan is in no point cloud; its features lie at another height along their line of sight.

@@ -95,7 +95,7 @@ class Solution:
 
 
 def frame_status(
-    recording: Recording, project: Project, ground: Ground, points_used: NDArray[np.int64], determined: Bools
+    recording: Recording, project: Project, ground: Ground, *, points_used: NDArray[np.int64], determined: Bools
 ) -> NDArray[np.str_]:
     """Return the status (F,) of a target's frames from how much of ground and target was seen.
 

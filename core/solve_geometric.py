@@ -62,10 +62,14 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
     speed = ground_speed(recording, lens)
     readout = _readout(recording, speed, start, reference, relief)
     recording = at_frame_times(recording, lens, readout.readout_s, speed)
-    calibration, used, slow_m = _calibrated(Evidence.of(recording, speed, project, start, reference, relief))
+    calibration, used, slow_m = _calibrated(
+        Evidence.of(recording, speed=speed, project=project, start=start, reference=reference, relief=relief)
+    )
     caught_up = replace(recording, ground_raw=recording.ground_raw + used.lag_s * np.nan_to_num(speed))
     frame0 = project.reference_frame
-    ground = solve_ground(caught_up, used.lens, used.pose0, reference.origin_m, relief, reference_frame=frame0)
+    ground = solve_ground(
+        caught_up, used.lens, used.pose0, origin_m=reference.origin_m, relief=relief, reference_frame=frame0
+    )
     flight, ground = _smoothed(caught_up, ground, used.lens)
     targets = {
         target.name: _solve_target(
@@ -127,7 +131,7 @@ def _readout(
         return Readout(start.lens.readout_s, None, "lens file")
     chosen = evenly_spread(len(recording.frame), READOUT_FRAMES)
     some = recording.selected(chosen)
-    ground = solve_ground(some, start.lens, start.pose0, reference.origin_m, relief)
+    ground = solve_ground(some, start.lens, start.pose0, origin_m=reference.origin_m, relief=relief)
     poses = ground.known_poses
     shifted = at_frame_times(replace(some, targets_raw={}), start.lens, READOUT_STEP_S, speed[chosen])
     rays = start.lens.rays_from_raw(shifted.ground_raw)
@@ -180,7 +184,7 @@ def _solve_target(
     still = during(recording.time_s, project.intervals_s.pre_event)
     fit = body.fit(points, still & ground.usable)
     used_points = (fit.weight > 0.1).reshape(len(fit.weight), -1).sum(axis=1)
-    status = frame_status(recording, project, ground, used_points, body.is_determined(fit))
+    status = frame_status(recording, project, ground, points_used=used_points, determined=body.is_determined(fit))
     at_rest = still & np.isin(status, MEASURED)
     moved = np.stack([fit.at(place, body.centre) for place in body.places], axis=1)
     start_m, start_rad = (
@@ -220,7 +224,7 @@ def _on_plane(
     recording: Recording, target: Target, used: Calibration, ground: Ground, *, z_m: float
 ) -> tuple[RestBody, Floats]:
     """Return a target at rest on the plane z, and its points (F, L, S, 2) or (F, N, 2) there in every frame, metres."""
-    body = rest_body(recording, target.name, used.lens, used.pose0, z_m)
+    body = rest_body(recording, target.name, lens=used.lens, pose0=used.pose0, z_m=z_m)
     return body, world_points(midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, z_m)
 
 

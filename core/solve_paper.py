@@ -112,7 +112,7 @@ def _solve_target(
     ground_m = GROUND_PART * ground.rms_px * pixel_m
     distance = float(np.linalg.norm(places[0, 0] - places[0, 1]))
     determined: Bools = np.isfinite(moved).all(axis=(1, 2))
-    status = frame_status(recording, project, ground, lines.used[1:].sum(axis=1), determined)
+    status = frame_status(recording, project, ground, points_used=lines.used[1:].sum(axis=1), determined=determined)
     still = during(recording.time_s, project.intervals_s.pre_event) & determined
     sigma = held_to_jitter(np.hypot(scale * spread[1:], ground_m[:, None, None]), moved, still)
     turned_sigma = held_to_jitter(np.sqrt((spread[1:] ** 2).sum(axis=(1, 2)) / 2) / distance, turned, still)

@@ -63,7 +63,7 @@ def displacement_bound(
     seen = recording.reference.targets_raw[target.name]
     on_roof = patches(luma, seen, noise) if seen.ndim == 2 else strips(luma, seen, noise)
     on_ground = patches(luma, recording.reference.ground_raw, noise)
-    body = rest_body(recording, target.name, lens, pose, height)
+    body = rest_body(recording, target.name, lens=lens, pose0=pose, z_m=height)
 
     def sight(at: Sightings, z_m: float, moves: bool) -> Callable[[Floats], Floats]:
         plan = intersect_height(pose.R, pose.centre_m, lens.rays_from_raw(at.raw), z_m)

@@ -95,7 +95,7 @@ def test_relief_below_the_clicks_is_taken_into_account() -> None:
     np.testing.assert_allclose(camera_of(fit), POSE.centre_m, atol=1e-6)
     assert fit.rms_px < 1e-6
     assert fit_reference(pairs, LENS).rms_px > 0.5
-    again = reference_pose(pairs, LENS, fit.origin_m, elevation)
+    again = reference_pose(pairs, LENS, origin_m=fit.origin_m, elevation_m=elevation)
     assert fit.pose is not None
     np.testing.assert_allclose(again.centre_m, fit.pose.centre_m, atol=1e-8)
 

@@ -180,12 +180,12 @@ def test_features_on_grass_hardly_count() -> None:
     project = scene.project_document()
     reference = fit_with_relief(project, scene.LENS, None)
     assert reference.pose is not None
-    ground = solve_ground(rough, scene.LENS, reference.pose, reference.origin_m, None)
+    ground = solve_ground(rough, scene.LENS, reference.pose, origin_m=reference.origin_m, relief=None)
     weight = ground.known_poses.weight
     assert weight[:, grass].mean() < 0.05 * weight[:, ~grass].mean()
     # They are not outliers for that: what a person is shown as rejected is what disagrees for its own standards.
     assert (ground.weight[:, grass] > 0.1).mean() > 0.9
-    alone = solve_ground(recording, scene.LENS, reference.pose, reference.origin_m, None)
+    alone = solve_ground(recording, scene.LENS, reference.pose, origin_m=reference.origin_m, relief=None)
     apart = np.abs(ground.known_poses.centre_m - alone.known_poses.centre_m).mean()
     assert apart < 0.3 * _equally_weighted_error(rough, alone.known_poses.centre_m, project)
 
@@ -193,7 +193,7 @@ def test_features_on_grass_hardly_count() -> None:
 def _equally_weighted_error(recording: Recording, centre_m: Floats, project: Project) -> float:
     reference = fit_with_relief(project, scene.LENS, None)
     assert reference.pose is not None
-    ground = solve_ground(recording, scene.LENS, reference.pose, reference.origin_m, None)
+    ground = solve_ground(recording, scene.LENS, reference.pose, origin_m=reference.origin_m, relief=None)
     rays = scene.LENS.rays_from_raw(recording.ground_raw)
     equal = fit_poses(rays, np.ones(rays.shape[:2]), ground.points_m, reference.pose, robust=False)
     return float(np.abs(equal.centre_m - centre_m).mean())
@@ -245,7 +245,7 @@ def test_what_the_cloud_shows_is_no_ground_even_if_the_camera_hardly_moves() -> 
     assert reference.pose is not None
     shown = []
     for known in (None, relief):
-        ground = solve_ground(recording, scene.LENS, reference.pose, reference.origin_m, known)
+        ground = solve_ground(recording, scene.LENS, reference.pose, origin_m=reference.origin_m, relief=known)
         shown.append(ground.known_poses.weight.max(axis=0) > 0)
     assert shown[0][on_containers()].all()
     assert not shown[1][on_containers()].any()
@@ -256,7 +256,7 @@ def test_a_camera_that_never_moves_tells_nothing_about_heights() -> None:
     still = replace(recording, ground_raw=np.repeat(recording.ground_raw[:1], 3, axis=0))
     reference = fit_with_relief(scene.project_document(), scene.LENS, None)
     assert reference.pose is not None
-    ground = solve_ground(still, scene.LENS, reference.pose, reference.origin_m, None)
+    ground = solve_ground(still, scene.LENS, reference.pose, origin_m=reference.origin_m, relief=None)
     assert (ground.known_poses.weight.max(axis=0) > 0).all()
 
 
@@ -266,7 +266,7 @@ def test_a_cloud_in_which_everything_stands_is_not_believed() -> None:
     relief = Relief(*(scene.SITE_M - 50.0).tolist(), 0.5, np.zeros((200, 200)), everywhere)
     reference = fit_with_relief(scene.project_document(), scene.LENS, None)
     assert reference.pose is not None
-    ground = solve_ground(recording, scene.LENS, reference.pose, reference.origin_m, relief)
+    ground = solve_ground(recording, scene.LENS, reference.pose, origin_m=reference.origin_m, relief=relief)
     assert ground.usable.all()
 
 
