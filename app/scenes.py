@@ -213,7 +213,7 @@ def _show_lines(here: Context, solved: Solved, place: int, exaggeration: float, 
     resting: dict[str, Floats] = {}
     for target in solved.inputs.project.targets:
         rest = lines_at_rest(solved.recording, solved.solution, target)
-        now = moved_lines(rest, solved.solution, target.name, place, exaggeration)
+        now = moved_lines(rest, solved.solution, name=target.name, place=place, exaggeration=exaggeration)
         resting |= {f"{target.name}/{line}": ends + above for line, ends in rest.items()}
         moved |= {f"{target.name}/{line}": ends + above for line, ends in now.items()}
     here.scene.set_lines(moved, resting, key)

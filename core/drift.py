@@ -133,6 +133,7 @@ def corner_sweep(
     values: ArrayLike,
     time_s: ArrayLike,
     interval_s: tuple[float, float],
+    *,
     corners_hz: Sequence[float] = SWEEP_CORNERS_HZ,
     order: int = 10,
 ) -> CornerSweep:
@@ -193,14 +194,16 @@ def filter_warnings(
     before, after = np.asarray(unfiltered_m, dtype=np.float64), np.asarray(filtered_m, dtype=np.float64)
     times = np.asarray(time_s, dtype=np.float64)
     return [
-        *_residual_warnings(before, after, times, intervals, None if steady_m is None else np.asarray(steady_m)),
+        *_residual_warnings(
+            before, after, times, intervals=intervals, steady=None if steady_m is None else np.asarray(steady_m)
+        ),
         *_pre_event_warnings(after, times, intervals, corner_hz),
         *_frequency_warnings(before, times, intervals, corner_hz),
     ]
 
 
 def _residual_warnings(
-    before: Floats, after: Floats, times: Floats, intervals: Intervals, steady: Floats | None
+    before: Floats, after: Floats, times: Floats, *, intervals: Intervals, steady: Floats | None
 ) -> list[str]:
     """A residual that stands out of the drift, and does not survive."""
     source = "before it" if steady is None else "by the geometric method"

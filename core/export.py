@@ -120,7 +120,7 @@ def write_results(folder: Path, results: Results, progress: Progress = silent) -
         write_history_csv(folder / f"{name}.csv", history)
     for name, figure in figures.items():
         write_atomically(folder / FIGURES_FOLDER / f"{name}.png", figure.png)
-    write_report(folder, _report_content(results, check, warnings, summary, figures))
+    write_report(folder, _report_content(results, check=check, warnings=warnings, summary=summary, figures=figures))
     _remove_stale(folder, set(histories), set(figures))
     write_summary(folder / SUMMARY_FILE, summary)
     return summary
@@ -416,6 +416,7 @@ def _flight(solution: Solution, poses: PoseFit) -> tuple[Floats, Floats]:
 
 def _report_content(
     results: Results,
+    *,
     check: GpsCheck | None,
     warnings: list[str],
     summary: Mapping[str, Any],

@@ -139,7 +139,9 @@ def target_figures(
         with suppress(InputError):
             corners = sorted({0.1, drift.corner_hz, 0.5})
             filtered = {hz: high_pass(raw_m[:, 0], history.time_s, hz, drift.order) for hz in corners}
-            drawn["corner_effect"] = corner_effect_figure(history.time_s, raw_m[:, 0], filtered, intervals, comparison)
+            drawn["corner_effect"] = corner_effect_figure(
+                history.time_s, raw_m[:, 0], filtered, intervals=intervals, comparison=comparison
+            )
     if comparison is not None:
         moved = history.p1_m if antenna_m is None else antenna_m
         drawn["gps"] = gps_figure(history.time_s, moved, comparison, intervals)
@@ -166,9 +168,15 @@ def history_figure(
         scale, unit = length_unit(*drawn)
         for (name, values), colour in zip(others.items(), (GREY, GREEN, ORANGE, PURPLE), strict=False):
             axes[axis].plot(history.time_s, scale * values[:, axis], color=colour, lw=0.8, label=name)
-        _band(axes[axis], history.time_s, scale * history.p1_m[:, axis], scale * history.p1_sigma_m[:, axis], axis)
+        _band(
+            axes[axis],
+            history.time_s,
+            values=scale * history.p1_m[:, axis],
+            sigma=scale * history.p1_sigma_m[:, axis],
+            place=axis,
+        )
         axes[axis].set_ylabel(f"{AXIS_NAMES[axis]}, {unit}")
-    _band(axes[2], history.time_s, 1e3 * history.rotation_rad, 1e3 * history.rotation_sigma_rad, 2)
+    _band(axes[2], history.time_s, values=1e3 * history.rotation_rad, sigma=1e3 * history.rotation_sigma_rad, place=2)
     axes[2].set_ylabel("rotation, mrad")
     axes[0].set_title(f"Displacement of {history.name} at P1")
     _legend(axes[0])
@@ -179,7 +187,7 @@ def history_figure(
     return figure
 
 
-def _band(axes: Axes, time_s: Floats, values: Floats, sigma: Floats, place: int) -> None:
+def _band(axes: Axes, time_s: Floats, *, values: Floats, sigma: Floats, place: int) -> None:
     colour = (*AXIS_COLOURS, GREEN)[place]
     axes.fill_between(time_s, values - 2 * sigma, values + 2 * sigma, color=colour, alpha=0.25, lw=0, label="±2 sigma")
     axes.plot(time_s, values, color=colour, label="measured")
@@ -261,9 +269,9 @@ def corner_effect_figure(
     time_s: ArrayLike,
     unfiltered_m: ArrayLike,
     filtered_m: Mapping[float, ArrayLike],
+    *,
     intervals: Intervals,
     comparison: GpsComparison | None = None,
-    *,
     axis: int = 0,
 ) -> Figure:
     """Draw what different corner frequencies make of the pre-event and of the event.

@@ -98,7 +98,7 @@ def smooth_flight(time_s: Floats, centre_m: Floats, misfit_px: Floats) -> Smooth
     departure = centre - np.column_stack([spline.fit(x, size)[0] for x in centre.T])
     size = relative ** _growth(relative, departure / (np.median(np.abs(departure), axis=0) + LEAST_NOISE_M))
     size = size / np.sqrt((size**2).mean())
-    columns = [_smooth(time_s, moments, x, size, cutoff_hz) for x in centre.T]
+    columns = [_smooth(time_s, moments, x, size=size, cutoff_hz=cutoff_hz) for x in centre.T]
     values, sigmas, models = zip(*columns, strict=True)
     return SmoothFlight(np.stack(values, 1), np.stack(sigmas, 1), tuple(models))
 
@@ -146,7 +146,7 @@ def _growth(relative: Floats, departure: Floats) -> float:
 
 
 def _smooth(
-    time_s: Floats, seen_s: Floats, value_m: Floats, size: Floats, cutoff_hz: float
+    time_s: Floats, seen_s: Floats, value_m: Floats, *, size: Floats, cutoff_hz: float
 ) -> tuple[Floats, Floats, FlightModel]:
     """Return the path at `time_s` (F,), the noise it keeps, and its model, from values (N,) at `seen_s`."""
     spline = _Spline(time_s, seen_s, cutoff_hz)

@@ -152,7 +152,7 @@ def _preview_line(frame: _Frame, band: Band, name: str) -> LinePreview:
     band_raw = fit.raw_from_plan(band_outline(band))
     none = LinePreview(band_plan, band_raw, np.empty((0, 2, 2)), np.empty((0, 2, 2)), None, None, None, "")
     try:
-        edges_raw = _edges(luma, ends, band, fit, name)
+        edges_raw = _edges(luma, ends, band=band, fit=fit, name=name)
     except InputError as error:
         return _without_line(none, str(error))
     edges_raw = edges_raw[np.isfinite(edges_raw).all(axis=(1, 2))]
@@ -183,7 +183,7 @@ def _without_line(none: LinePreview, message: str) -> LinePreview:
     )
 
 
-def _edges(luma: Luma, ends: Floats, band: Band, fit: ReferenceFit, name: str) -> Floats:
+def _edges(luma: Luma, ends: Floats, *, band: Band, fit: ReferenceFit, name: str) -> Floats:
     """Return (STATIONS, 2, 2) both edges at each station, raw pixels, nan where not found."""
     raw = fit.raw_from_plan(ends)
     if not np.isfinite(raw).all():

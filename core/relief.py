@@ -108,7 +108,7 @@ def rasterise(cloud: Cloud, plane: GroundPlane, extent_m: tuple[float, float, fl
     places = np.stack([x.ravel(), y.ravel()], axis=1)
     above_plane = np.nan_to_num(ground_elevation(cloud, plane, places))
     datum = plane.z_m(places) - plane.z_m(at_m)
-    standing = _standing(cloud, plane, np.array([west, south]), cell, x.shape)
+    standing = _standing(cloud, plane, corner_m=np.array([west, south]), cell_m=cell, shape=x.shape)
     return Relief(
         west,
         south,
@@ -118,7 +118,7 @@ def rasterise(cloud: Cloud, plane: GroundPlane, extent_m: tuple[float, float, fl
     )
 
 
-def _standing(cloud: Cloud, plane: GroundPlane, corner_m: Floats, cell_m: float, shape: tuple[int, ...]) -> Floats:
+def _standing(cloud: Cloud, plane: GroundPlane, *, corner_m: Floats, cell_m: float, shape: tuple[int, ...]) -> Floats:
     """Return how high above the plane lies what most points of a cell show, 0 where that is ground, or nothing."""
     points, high, height = (np.zeros(shape[0] * shape[1]) for _ in range(3))
     for batch in batches(len(cloud.points_m), PASS_POINTS):

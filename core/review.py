@@ -66,7 +66,7 @@ class FrameOverlay:
 
 
 def frame_overlay(
-    recording: Recording, solution: Solution, project: Project, number: int, measured: FrameMeasurement | None
+    recording: Recording, solution: Solution, project: Project, *, number: int, measured: FrameMeasurement | None
 ) -> FrameOverlay | None:
     """Return what was measured in a frame, or None where the recording does not have it.
 
@@ -87,7 +87,8 @@ def frame_overlay(
         ground_used=ground[used],
         ground_rejected=ground[seen & ~used],
         targets={
-            target.name: _target_overlay(recording, solution, target, place, measured) for target in project.targets
+            target.name: _target_overlay(recording, solution, target, place=place, measured=measured)
+            for target in project.targets
         },
         pose=camera_at(solution, place),
     )
@@ -110,7 +111,7 @@ def camera_path(solution: Solution) -> Floats | None:
 
 
 def _target_overlay(
-    recording: Recording, solution: Solution, target: Target, place: int, measured: FrameMeasurement | None
+    recording: Recording, solution: Solution, target: Target, *, place: int, measured: FrameMeasurement | None
 ) -> TargetOverlay:
     raw = recording.targets_raw[target.name][place]
     if raw.ndim == 2:
@@ -168,7 +169,7 @@ def lines_at_rest(recording: Recording, solution: Solution, target: Target) -> d
 
 
 def moved_lines(
-    rest: Mapping[str, Floats], solution: Solution, name: str, place: int, exaggeration: float
+    rest: Mapping[str, Floats], solution: Solution, *, name: str, place: int, exaggeration: float
 ) -> dict[str, Floats]:
     """Return a target's lines moved as in the frame at a place of the recording, the motion exaggerated.
 

@@ -194,7 +194,7 @@ def read_gps(path: Path, settings: GpsInput) -> GpsRecord:
                 "project.json."
             )
     places = [header.index(name) for name in columns.values()]
-    rows = [_numbers(path, line, text, separator, places, header) for line, text in lines[1:]]
+    rows = [_numbers(path, line, text, separator=separator, places=places, header=header) for line, text in lines[1:]]
     if len(rows) < 4:
         raise InputError(f"{path}: has {len(rows)} positions; at least four are needed for a comparison.")
     table = np.array(rows, dtype=np.float64)
@@ -263,7 +263,7 @@ def _content_lines(path: Path) -> list[tuple[int, str]]:
 
 
 def _numbers(
-    path: Path, line: int, text: str, separator: str, places: list[int], header: list[str]
+    path: Path, line: int, text: str, *, separator: str, places: list[int], header: list[str]
 ) -> tuple[float, ...]:
     fields = next(csv.reader([text], delimiter=separator))
     values = []
@@ -334,9 +334,13 @@ def compare_with_gps(
         rms_m=read_only(np.sqrt(np.nanmean(error_m**2, axis=0))),
         sample_step_s=float(np.median(np.diff(gps.time_s))),
         frame_step_s=float(np.median(np.diff(times))),
-        peak_positive=_peak_rows(times, moved, sample_s, sample_m, video_m, intervals, sign=1),
-        peak_negative=_peak_rows(times, moved, sample_s, sample_m, video_m, intervals, sign=-1),
-        residual=_residual_rows(times, moved, sample_s, sample_m, intervals),
+        peak_positive=_peak_rows(
+            times, moved, sample_s=sample_s, sample_m=sample_m, video_m=video_m, intervals=intervals, sign=1
+        ),
+        peak_negative=_peak_rows(
+            times, moved, sample_s=sample_s, sample_m=sample_m, video_m=video_m, intervals=intervals, sign=-1
+        ),
+        residual=_residual_rows(times, moved, sample_s=sample_s, sample_m=sample_m, intervals=intervals),
     )
 
 
@@ -503,11 +507,11 @@ Rows = tuple[ComparisonRow | None, ComparisonRow | None]
 def _peak_rows(
     times: Floats,
     moved: Floats,
+    *,
     sample_s: Floats,
     sample_m: Floats,
     video_m: Floats,
     intervals: Intervals,
-    *,
     sign: int,
 ) -> Rows:
     """Return the extremes within the event, each record at its own rate as in the paper, and the video at GPS's."""
@@ -529,7 +533,7 @@ def _at_gps(row: ComparisonRow | None, gps_m: Floats, video_m: Floats) -> Compar
     return row if math.isnan(then_m) else replace(row, video_at_gps_m=then_m)
 
 
-def _residual_rows(times: Floats, moved: Floats, sample_s: Floats, sample_m: Floats, intervals: Intervals) -> Rows:
+def _residual_rows(times: Floats, moved: Floats, *, sample_s: Floats, sample_m: Floats, intervals: Intervals) -> Rows:
     if intervals.residual is None:
         return None, None
     window = intervals.residual

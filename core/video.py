@@ -242,7 +242,7 @@ class FramesAhead:
         self._ended = False
         self._stopped = threading.Event()
         threads = threads or min(MOST_THREADS, THREADS_PER_CORE * available_cores())
-        decoded = _decoded(path, self._index, start, stop, threads)
+        decoded = _decoded(path, self._index, start=start, stop=stop, threads=threads)
         pictures = (_Picture(picture.pts, luma_of(picture)) for picture in decoded)
         self._thread = threading.Thread(target=self._decode, args=(pictures,), name="video decoder", daemon=True)
         self._thread.start()
@@ -353,12 +353,14 @@ def read_frames_rgb(path: File, start: int = 0, stop: int | None = None) -> Iter
         InputError: as `read_frames`.
     """
     index = frame_index(path)
-    for picture in _decoded(path, index, start, stop, available_cores()):
+    for picture in _decoded(path, index, start=start, stop=stop, threads=available_cores()):
         if (number := index.number_at(picture.pts)) is not None:
             yield number, np.ascontiguousarray(np.rot90(picture.to_ndarray(format="rgb24"), picture.rotation // 90))
 
 
-def _decoded(path: File, index: FrameIndex | None, start: int, stop: int | None, threads: int) -> Iterator[VideoFrame]:
+def _decoded(
+    path: File, index: FrameIndex | None, *, start: int, stop: int | None, threads: int
+) -> Iterator[VideoFrame]:
     """Yield what can be decoded of frames `start` to `stop`, or of the whole file where there is no index."""
     if index is not None and start >= len(index):
         raise InputError(f"{path}: has {len(index)} frames, so there is no frame {start}; choose a smaller number.")

@@ -45,7 +45,7 @@ def drift(wanted: Filter, folder: Folder, here: Here) -> dict[str, Any]:
     filtered = high_pass(raw, history.time_s, wanted.corner_hz, wanted.order)
     at_rest = None
     if wanted.interval is not None:
-        found = corner_sweep(raw, history.time_s, wanted.interval, [wanted.corner_hz], wanted.order)
+        found = corner_sweep(raw, history.time_s, wanted.interval, corners_hz=[wanted.corner_hz], order=wanted.order)
         at_rest = {"dx": plain(found.rms_m[0, 0]), "dy": plain(found.rms_m[0, 1])}
     return {
         "frame": history.frame.tolist(),

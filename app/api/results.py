@@ -170,7 +170,7 @@ def review(number: int, folder: Folder, here: Here, method: Method | None = None
     project = folder.load().project
     solved = here.outcomes.solved(folder, project, method)
     record = outcome.frame_record(folder, solved, number)
-    seen = frame_overlay(solved.recording, solved.solution, solved.inputs.project, number, record)
+    seen = frame_overlay(solved.recording, solved.solution, solved.inputs.project, number=number, measured=record)
     if seen is None:
         raise Missing(f"Frame {number} has not been measured.", path="frame")
     return _overlay(seen)

@@ -63,7 +63,7 @@ def pre_event_figure() -> Figure:
 def effect_figure() -> Figure:
     raw_m = history().p1_raw_m[:, 0]
     filtered = {corner: high_pass(raw_m, TIME_S, corner) for corner in (0.1, 0.25, 0.5)}
-    return figures.corner_effect_figure(TIME_S, raw_m, filtered, INTERVALS, comparison())
+    return figures.corner_effect_figure(TIME_S, raw_m, filtered, intervals=INTERVALS, comparison=comparison())
 
 
 def frame_figure() -> Figure:
