@@ -258,10 +258,10 @@ class Jobs:
         for stream in (process.stdin, process.stdout, process.stderr):
             if stream is not None and not (stream is process.stderr and drain.is_alive()):
                 _close(stream)
-        self._end(project, job, end, finish, "".join(complaints))
+        self._end(project, job, end=end, finish=finish, complaints="".join(complaints))
 
     def _end(
-        self, project: ProjectFolder, job: Job, end: dict[str, Any] | None, finish: Finish | None, complaints: str
+        self, project: ProjectFolder, job: Job, *, end: dict[str, Any] | None, finish: Finish | None, complaints: str
     ) -> None:
         try:
             if end is None and job.asked_to_stop:

@@ -75,7 +75,7 @@ def _show(here: Context, folder: ProjectFolder, view: View) -> dict[str, Any]:
     here.scene.open(folder.id, origin, lambda start, along: _picked(here, folder, start, along))
     shown = _show_site(here, folder, site, view) if site is not None else 0
     if fit is not None and fit.pose is not None:
-        _show_flight(here, folder, project, site, fit, view)
+        _show_flight(here, folder, project, site=site, fit=fit, view=view)
     else:
         here.scene.drop("camera")
         here.scene.drop("lines")
@@ -111,7 +111,7 @@ def _show_site(here: Context, folder: ProjectFolder, site: Site, view: View) -> 
         here.scene.set_cloud(CloudView(thinned.points_m.astype(np.float32), colours, spacing), key)
         shown = len(thinned)
         lowest, highest = site.cloud.extent_m
-        here.scene.look(np.append(site.plane.at_m[:2], site.plane.at_m[2]), float(np.max(highest - lowest)) * 0.6)
+        here.scene.look(np.array(site.plane.at_m), float(np.max(highest - lowest)) * 0.6)
     if not here.scene.has("ground", site.key):
         here.scene.set_ground(_ground(site), site.key)
     _show_orthoimage(here, folder, site)
@@ -154,7 +154,7 @@ def _show_orthoimage(here: Context, folder: ProjectFolder, site: Site) -> None:
 
 
 def _show_flight(
-    here: Context, folder: ProjectFolder, project: Project, site: Site | None, fit: ReferenceFit, view: View
+    here: Context, folder: ProjectFolder, project: Project, *, site: Site | None, fit: ReferenceFit, view: View
 ) -> None:
     """Show the camera at a frame, its path, and the roof lines as they have moved."""
     frame = project.reference_frame if view.frame is None else view.frame
@@ -166,14 +166,14 @@ def _show_flight(
     key = (video, frame, pose.centre_m.tobytes(), pose.R.tobytes(), None if path is None else path.tobytes())
     if not here.scene.has("camera", key):
         moved = Pose(pose.R, pose.centre_m + above)
-        camera = _camera(here, folder, project, frame, fit, moved)
+        camera = _camera(here, folder, project, frame=frame, fit=fit, pose=moved)
         here.scene.set_camera(camera, None if path is None else path + above, key)
     if solved is None or place is None:
         here.scene.drop("lines")
         return
     lines_key = (solved, place, view.exaggeration)
     if not here.scene.has("lines", lines_key):
-        _show_lines(here, solved, place, view.exaggeration, above, lines_key)
+        _show_lines(here, solved, place, exaggeration=view.exaggeration, above=above, key=lines_key)
 
 
 def _solved_if_measured(here: Context, folder: ProjectFolder, project: Project) -> Solved | None:
@@ -208,7 +208,7 @@ def _pose_and_path(fit: ReferenceFit, solved: Solved | None, place: int | None) 
     return measured or pose, camera_path(solved.solution)
 
 
-def _show_lines(here: Context, solved: Solved, place: int, exaggeration: float, above: Floats, key: Any) -> None:
+def _show_lines(here: Context, solved: Solved, place: int, *, exaggeration: float, above: Floats, key: Any) -> None:
     moved: dict[str, Floats] = {}
     resting: dict[str, Floats] = {}
     for target in solved.inputs.project.targets:
@@ -220,7 +220,7 @@ def _show_lines(here: Context, solved: Solved, place: int, exaggeration: float, 
 
 
 def _camera(
-    here: Context, folder: ProjectFolder, project: Project, frame: int, fit: ReferenceFit, pose: Pose
+    here: Context, folder: ProjectFolder, project: Project, *, frame: int, fit: ReferenceFit, pose: Pose
 ) -> CameraView:
     picture = scaled_to(here.frames.frame(folder.require_video(project), frame), _PICTURE_WIDTH)
     width, height = fit.lens.image_size_px

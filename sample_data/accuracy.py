@@ -240,9 +240,18 @@ def score(clip: Clip, inputs: LoadedInputs, keep: bool) -> list[Score]:
         rest = solution.targets[target.name].rest_m
         true = true_displacement(truth, target.name, rest, target.kind)
         alone = target.relative_to is None
-        bound_m = displacement_bound(inputs, recording, solution, target, noise) if alone else np.nan
+        bound_m = displacement_bound(inputs, recording, solution, target=target, noise=noise) if alone else np.nan
         label = clip.row + (f": {target.name}" if len(inputs.project.targets) > 1 else "")
-        one = _scored(label, history, true, truth["hidden"], inputs.project.intervals_s, bound_m, frame_ms, clip.scene)
+        one = _scored(
+            label,
+            history,
+            true,
+            hidden=truth["hidden"],
+            intervals=inputs.project.intervals_s,
+            bound_m=bound_m,
+            frame_ms=frame_ms,
+            scene=clip.scene,
+        )
         scores.append(replace(one, camera_by_bound=camera_by_bound))
     return scores
 
@@ -251,6 +260,7 @@ def _scored(
     label: str,
     history: TargetHistory,
     true: Floats,
+    *,
     hidden: NDArray[np.bool_],
     intervals: Intervals,
     bound_m: float,

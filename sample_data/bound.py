@@ -48,7 +48,7 @@ class Sightings:
 
 
 def displacement_bound(
-    inputs: LoadedInputs, recording: Recording, solution: Solution, target: Target, noise: tuple[float, float]
+    inputs: LoadedInputs, recording: Recording, solution: Solution, *, target: Target, noise: tuple[float, float]
 ) -> float:
     """Return the least standard deviation, metres: root mean square over P1 and P2 along x and y.
 

@@ -131,7 +131,7 @@ class Camera:
         if self.scene.body is not None:
             self._shade(self.scene.body, time_s, luma)
             for quad, texture in _walls_seen(self.scene.body, time_s, self.scene.flight.pose(time_s)[1][0]):
-                self._stand(quad, texture, time_s, luma, chroma)
+                self._stand(quad, texture, time_s, luma=luma, chroma=chroma)
         for plate in self._high_plates:
             self._lay(plate, time_s, luma, chroma)
         if self.scene.light.cloud is not None:
@@ -258,7 +258,7 @@ class Camera:
         own = np.stack((c * away[..., 0] + s * away[..., 1], -s * away[..., 0] + c * away[..., 1]), axis=-1)
         return plate.texture.texels(own)
 
-    def _stand(self, quad: Floats, texture: Texture, time_s: float, luma: Image, chroma: Image) -> None:
+    def _stand(self, quad: Floats, texture: Texture, time_s: float, *, luma: Image, chroma: Image) -> None:
         """Draw a wall, (4, 3) world corners: foot left, foot right, top right, top left seen from outside."""
         window = self._lattices[0].window(self.project(quad, time_s), self.scene.lens.image_size_px)
         if window is None:

@@ -175,7 +175,7 @@ def paint_roof(
     look = RoofLook.random(rng)
     half_x, half_y = size_m[0] / 2, size_m[1] / 2
     canvas = Canvas((-half_x, -half_y, half_x, half_y), texel_m, look.sheet, (-2.0, 3.0))
-    _boards(canvas, rng, look, lines, half_x, half_y, contrast)
+    _boards(canvas, rng, look, lines, half_x=half_x, half_y=half_y, contrast=contrast)
     strip = rng.uniform(0.055, 0.095)
     pitch = abs(lines.l1_y_m - lines.l2_y_m)
     along = look.sheet + contrast * (look.along - look.sheet)
@@ -187,7 +187,7 @@ def paint_roof(
     for k in range(-4, 5):
         _strip_across(canvas, lines.t1_x_m + 2 * k * pitch, strip, (-half_y, half_y), across * rng.uniform(0.96, 1.04))
     _strip_across(canvas, lines.t1_x_m + 0.37, strip, (-half_y, 0.4 * half_y), across)
-    _furniture(canvas, rng, look, lines, half_x, half_y)
+    _furniture(canvas, rng, look, lines, half_x=half_x, half_y=half_y)
     canvas.box((-half_x, half_y - 0.18, half_x, half_y), look.sheet * 0.7)
     canvas.box((-half_x, -half_y, half_x, -half_y + 0.18), look.sheet * 1.2)
     for size, share in ((0.006, 0.02), (0.03, 0.015), (0.15, 0.012), (0.9, 0.02)):
@@ -196,7 +196,7 @@ def paint_roof(
 
 
 def _boards(
-    canvas: Canvas, rng: Rng, look: RoofLook, lines: RoofLines, half_x: float, half_y: float, contrast: float
+    canvas: Canvas, rng: Rng, look: RoofLook, lines: RoofLines, *, half_x: float, half_y: float, contrast: float
 ) -> None:
     """Paint boards of different brightness that meet under the strips, so that a strip's two sides differ."""
     pitch = abs(lines.l1_y_m - lines.l2_y_m)
@@ -218,7 +218,7 @@ def _strip_across(canvas: Canvas, x_m: float, width_m: float, y_m: tuple[float, 
     canvas.box((x_m - width_m / 2, y_m[0], x_m + width_m / 2, y_m[1]), grey)
 
 
-def _furniture(canvas: Canvas, rng: Rng, look: RoofLook, lines: RoofLines, half_x: float, half_y: float) -> None:
+def _furniture(canvas: Canvas, rng: Rng, look: RoofLook, lines: RoofLines, *, half_x: float, half_y: float) -> None:
     """Put hatches, vents and cables on the roof; cables cross the lines, hatches leave most of them free."""
     for x, y, wide, deep in (
         (-0.72, 0.7, 0.9, 0.9),

@@ -229,7 +229,7 @@ def finished_project(scene: Scene, camera: Camera) -> Project:
         ),
         orthoimage=Orthoimage(pixel_size_m=0.02),
         reference_frame=_REFERENCE_FRAME,
-        correspondences=tuple(_clicks(scene, camera, regions, rng, origin)),
+        correspondences=tuple(_clicks(scene, camera, regions=regions, rng=rng, origin=origin)),
         moving_regions_px=tuple(tuple(_point(corner, 1) for corner in region) for region in regions),
         targets=tuple(_target(scene, one, rng, origin) for one in scene.measured),
         intervals_s=Intervals(**scene.survey.intervals_s),
@@ -261,7 +261,7 @@ def ground_under(scene: Scene, raw_px: Floats) -> Floats:
 
 
 def _clicks(
-    scene: Scene, camera: Camera, regions: list[Floats], rng: np.random.Generator, origin: Floats
+    scene: Scene, camera: Camera, *, regions: list[Floats], rng: np.random.Generator, origin: Floats
 ) -> list[Correspondence]:
     """Return 20 well spread pairs on marks one can recognise on free ground: the best first, then the next best."""
     marks = _marks_in_frame(scene, camera, regions)
