@@ -36,7 +36,7 @@ def lens_of(folder: ProjectFolder, project: Project) -> tuple[Lens, bool]:
     info = video_info(video)
     size = {"width": info.width, "height": info.height}
     if project.inputs.lens is None:
-        return Lens.ideal((info.width, info.height), max(info.width, info.height)), False
+        return Lens.stand_in((info.width, info.height)), False
     path = folder.require_input("lens", project)
     lens = _lens(fingerprint(path))
     require_image_size(lens, **size, lens_file=path.name, video_file=video.name)

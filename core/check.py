@@ -166,7 +166,7 @@ def _fit_reference(project: Project, lens: Lens | None, info: VideoInfo) -> Refe
     size = (info.width, info.height)
     if lens is not None and lens.image_size_px != size:
         return None
-    return fit_reference(project.correspondences, lens or Lens.ideal(size, max(size)), has_lens=lens is not None)
+    return fit_reference(project.correspondences, lens or Lens.stand_in(size), has_lens=lens is not None)
 
 
 def _video_problems(project: Project, inputs: _Inputs) -> Iterator[str]:

@@ -76,6 +76,11 @@ class Lens:
         K = np.array([[focal_px, 0.0, (width - 1) / 2], [0.0, focal_px, (height - 1) / 2], [0.0, 0.0, 1.0]])
         return cls(image_size_px, K, np.zeros(5))
 
+    @classmethod
+    def stand_in(cls, image_size_px: tuple[int, int]) -> Lens:
+        """Return the ideal lens that serves where none is known, its focal length the longer side of the image."""
+        return cls.ideal(image_size_px, float(max(image_size_px)))
+
     @property
     def focal_px(self) -> Floats:
         """(2,) fx, fy."""
