@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 
 import pytest
 
-from tests.browser.live import SAMPLE, chromium, free_port, serving
+from tests.browser.live import SAMPLE, chromium, folder_name, free_port, measured_sample, serving, shared_folder
 
 
 @pytest.fixture(scope="session")
@@ -17,11 +16,19 @@ def browser():
         yield found
 
 
+@pytest.fixture(scope="session")
+def measured(tmp_path_factory):
+    """The folder of the sample with the headless engine's results, which no test changes."""
+    return measured_sample(shared_folder(tmp_path_factory) / "measured-sample")
+
+
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
-    """A workspace and the address of the server over it."""
+    """A workspace with what an engineer brings, and the address of the server over it."""
     workspace = tmp_path_factory.mktemp("workspace")
-    shutil.copytree(SAMPLE, workspace / "footage", ignore=shutil.ignore_patterns("project.json", "results"))
+    shutil.copytree(
+        SAMPLE, workspace / "footage", ignore=shutil.ignore_patterns("project.json", "results", "truth.csv")
+    )
     with serving(workspace, free_port()) as address:
         yield workspace, address
 
@@ -30,7 +37,7 @@ def server(tmp_path_factory):
 def project(server, request):
     """The sample as a project of its own for each test: its folder and its pages' address."""
     workspace, address = server
-    name = re.sub(r"[^a-z0-9]+", "-", request.node.name)[-40:].strip("-")
+    name = folder_name(request)
     folder = workspace / name
     folder.mkdir()
     document = json.loads((SAMPLE / "project.json").read_text())

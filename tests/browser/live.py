@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -115,6 +116,11 @@ def measured_sample(shared: Path) -> Path:
             shutil.copytree(SAMPLE, folder, ignore=shutil.ignore_patterns("results"), dirs_exist_ok=True)
             run_project(folder)
     return folder
+
+
+def folder_name(request: pytest.FixtureRequest) -> str:
+    """Return the name of a folder for one test alone."""
+    return re.sub(r"[^a-z0-9]+", "-", request.node.name)[-40:].strip("-")
 
 
 def eventually(holds: Callable[[], bool], seconds: float = 20.0) -> None:

@@ -14,7 +14,7 @@ from playwright.sync_api import Locator, Page, expect
 
 from app.scene3d import line_colours
 from tests.browser.hands import Placement, fitted, zoomed
-from tests.browser.live import ask, ask_bytes, free_port, measured_sample, serving, shared_folder, watched
+from tests.browser.live import ask, ask_bytes, free_port, serving, watched
 from tests.browser.steps import FRAME_SIZE, pane, pixels, ready
 
 STEPS = ("inputs", "orthoimage", "correspondences", "regions", "track", "review?view=both", "drift", "export")
@@ -24,10 +24,10 @@ FAR_PX = 40
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory):
+def pages(measured, tmp_path_factory):
     """The address of the pages of the shipped sample, measured; no test changes it."""
     workspace = tmp_path_factory.mktemp("workspace")
-    shutil.copytree(measured_sample(shared_folder(tmp_path_factory) / "measured-sample"), workspace / "sample")
+    shutil.copytree(measured, workspace / "sample")
     with serving(workspace, free_port()) as address:
         yield f"{address}/p/sample"
 

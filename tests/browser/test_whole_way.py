@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from playwright.sync_api import Page, expect
 
 from core.project import Project, read_project
 from core.results import read_history_csv
-from tests.browser.live import SAMPLE, ask, eventually, free_port, measured_sample, serving, shared_folder, watched
+from tests.browser.live import SAMPLE, ask, eventually, watched
 from tests.browser.steps import (
     FRAME_SIZE,
     click_frame,
@@ -34,20 +33,7 @@ CLICK_PX = 0.25
 PIXEL_CM = 2.0
 
 
-@pytest.fixture(scope="module")
-def headless(tmp_path_factory):
-    return measured_sample(shared_folder(tmp_path_factory) / "measured-sample")
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    workspace = tmp_path_factory.mktemp("workspace")
-    shutil.copytree(SAMPLE, workspace / "footage", ignore=shutil.ignore_patterns("project.json", "truth.csv"))
-    with serving(workspace, free_port()) as address:
-        yield workspace, address
-
-
-def test_from_four_files_to_the_csv_that_the_headless_engine_writes(browser, server, headless):
+def test_from_four_files_to_the_csv_that_the_headless_engine_writes(browser, server, measured):
     workspace, address = server
     folder, pages = workspace / "first-try", f"{address}/p/first-try"
     decided = read_project(SAMPLE)
@@ -61,13 +47,13 @@ def test_from_four_files_to_the_csv_that_the_headless_engine_writes(browser, ser
         look_through(page, pages)
         tell_intervals(page, pages, decided)
         sweep_corners(page, pages)
-        downloaded = download(page, pages, folder, headless)
+        downloaded = download(page, pages, folder, measured)
     made = read_project(folder)
     aimed = np.array([pair.frame_px for pair in decided.correspondences])
     missed = np.array([pair.frame_px for pair in made.correspondences]) - aimed
     assert len(missed) == 20
     assert 0.5 * CLICK_PX < missed.std() < 1.5 * CLICK_PX
-    agree(downloaded, headless / "results" / "roof.csv", decided)
+    agree(downloaded, measured / "results" / "roof.csv", decided)
 
 
 def tell_antenna(page: Page, decided: Project) -> None:
