@@ -13,14 +13,20 @@ from app.sites import read_site
 from app.store import CACHE_FOLDER, ProjectFolder, read_json
 from core.coordinates import OrthoGrid
 from core.errors import InputError
-from core.orthoimage import make_orthoimage, read_geotiff, read_grid, write_geotiff
+from core.orthoimage import (
+    ORTHOIMAGE_FILE,
+    make_orthoimage,
+    origin_of,
+    read_geotiff,
+    read_grid,
+    read_origin,
+    write_geotiff,
+    write_origin,
+)
 from core.progress import CancelToken, Progress
 from core.project import RESULTS_FOLDER, Project, read_project
-from core.project import Orthoimage as Settings
 from core.storage import write_atomically
 
-ORTHOIMAGE_FILE = "orthoimage.tif"
-_MADE_FROM = "orthoimage.made-from"
 _NOTE = "orthoimage.json"
 
 
@@ -66,16 +72,7 @@ def _is_stale(folder: ProjectFolder, project: Project, grid: OrthoGrid) -> bool:
     cloud = folder.input_path("cloud", project)
     if cloud is None or not cloud.is_file():
         return True
-    try:
-        made_from = (folder.results / _MADE_FROM).read_text(encoding="utf-8")
-    except OSError:
-        return True
-    return made_from != _origin(identity(cloud), settings)
-
-
-def _origin(cloud: str, settings: Settings) -> str:
-    """Return what an orthoimage is made from, as a run of the engine notes it down too."""
-    return f"{cloud} {settings.model_dump_json()}"
+    return read_origin(folder.results / ORTHOIMAGE_FILE) != origin_of(identity(cloud), settings)
 
 
 @lru_cache(maxsize=2)
@@ -120,8 +117,7 @@ def build(folder: Path, order: dict[str, Any], progress: Progress, cancel: Cance
     cancel.raise_if_cancelled()
     file = folder / RESULTS_FOLDER / ORTHOIMAGE_FILE
     write_geotiff(file, ortho)
-    made_from = _origin(identity(Path(order["cloud"])), project.orthoimage)
-    write_atomically(file.with_name(_MADE_FROM), made_from.encode())
+    write_origin(file, origin_of(identity(Path(order["cloud"])), project.orthoimage))
     note = {
         "made": list(fingerprint(file)[1:]),
         "measured_share": ortho.measured_share,

@@ -23,6 +23,7 @@ from core.cloud import Cloud, height_at, pick, thin
 from core.coordinates import Floats
 from core.errors import InputError
 from core.georeference import ReferenceFit
+from core.orthoimage import ORTHOIMAGE_FILE
 from core.project import Project
 from core.review import camera_at, camera_path, lines_at_rest, moved_lines
 from core.run import relief_plan
@@ -143,7 +144,7 @@ def _ground(site: Site) -> GroundView:
 
 def _show_orthoimage(here: Context, folder: ProjectFolder, site: Site) -> None:
     try:
-        key = fingerprint(folder.results / orthoimages.ORTHOIMAGE_FILE)
+        key = fingerprint(folder.results / ORTHOIMAGE_FILE)
     except InputError:
         here.scene.drop("orthoimage")
         return

@@ -24,6 +24,7 @@ from core.storage import write_atomically
 Pixels = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
 
+ORTHOIMAGE_FILE = "orthoimage.tif"
 MAX_PIXELS = 60_000_000
 # Larger gaps are shadows of the scanner, not spaces between neighbouring points.
 MAX_FILL_M = 0.25
@@ -332,6 +333,28 @@ def read_grid(path: Path | str) -> OrthoGrid:
         raise InputError(f"{path}: not found; make the orthoimage first.") from None
     except (OSError, ValueError, KeyError, IndexError, tifffile.TiffFileError) as error:
         raise InputError(f"{path}: is no orthoimage of this program ({error}); make it again.") from None
+
+
+def origin_of(cloud_identity: str, settings: Settings) -> str:
+    """Return what an orthoimage is made from, in words to compare: the cloud's content and the settings."""
+    return f"{cloud_identity} {settings.model_dump_json()}"
+
+
+def read_origin(orthoimage: Path) -> str | None:
+    """Return what an orthoimage was made from; None where there is none, or nobody knows."""
+    try:
+        return _origin_file(orthoimage).read_text(encoding="utf-8") if orthoimage.exists() else None
+    except OSError:
+        return None
+
+
+def write_origin(orthoimage: Path, origin: str) -> None:
+    """Note beside an orthoimage what it was made from; see `origin_of`."""
+    write_atomically(_origin_file(orthoimage), origin.encode())
+
+
+def _origin_file(orthoimage: Path) -> Path:
+    return orthoimage.with_suffix(".made-from")
 
 
 def rectify_frame(frame: Pixels, lens: Lens, H_plan_und: ArrayLike, grid: OrthoGrid) -> tuple[Pixels, Bools]:

@@ -26,7 +26,7 @@ from core.lens import Lens, read_lens, require_image_size
 from core.locks import take_lock
 from core.measure import measure
 from core.measurements import MeasurementStore, Recording
-from core.orthoimage import make_orthoimage, write_geotiff
+from core.orthoimage import ORTHOIMAGE_FILE, make_orthoimage, origin_of, read_origin, write_geotiff, write_origin
 from core.prediction import MeasureSetup
 from core.progress import CancelToken, Progress, silent
 from core.project import PROJECT_FILE, RESULTS_FOLDER, Project, naming_file, read_project
@@ -40,7 +40,6 @@ FRAMES_FILE = "frames.sqlite"
 RELIEF_FILE = "relief.npz"
 # Counts up when a relief keeps something else, so that none of an earlier version is taken for it.
 RELIEF_VERSION = 2
-ORTHOIMAGE_FILE = "orthoimage.tif"
 # How far around the clicks the relief of the ground is kept, metres.
 RELIEF_MARGIN_M = 15.0
 
@@ -313,14 +312,13 @@ def _write_orthoimage(inputs: LoadedInputs, progress: Progress) -> None:
     if inputs.project.inputs.cloud is None:
         return
     file = inputs.folder / RESULTS_FOLDER / ORTHOIMAGE_FILE
-    note = file.with_suffix(".made-from")
-    settings = inputs.project.orthoimage.model_dump_json()
-    made_from = f"{_cloud_identity(inputs.folder / inputs.project.inputs.cloud)} {settings}"
-    if file.exists() and note.exists() and note.read_text() == made_from:
+    settings = inputs.project.orthoimage
+    origin = origin_of(_cloud_identity(inputs.folder / inputs.project.inputs.cloud), settings)
+    if read_origin(file) == origin:
         return
     cloud, plane = read_ground(inputs.folder, inputs.project, progress)
-    write_geotiff(file, make_orthoimage(cloud, plane, inputs.project.orthoimage, progress))
-    write_atomically(note, made_from.encode())
+    write_geotiff(file, make_orthoimage(cloud, plane, settings, progress))
+    write_origin(file, origin)
 
 
 def input_files(project: Project) -> list[str]:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -13,10 +15,13 @@ from core.lens import Lens
 from core.orthoimage import (
     MAX_FILL_M,
     make_orthoimage,
+    origin_of,
     read_geotiff,
     read_grid,
+    read_origin,
     rectify_frame,
     write_geotiff,
+    write_origin,
 )
 from core.project import Orthoimage as Settings
 
@@ -213,3 +218,13 @@ def test_a_frame_shown_smaller_does_not_alias():
     H_plan_und = np.array([[0.01, 0.0, 0.0], [0.0, -0.01, 8.0], [0.0, 0.0, 1.0]])
     small, outside = rectify_frame(stripes, lens, H_plan_und, OrthoGrid(0.0, 8.0, 0.05, 160, 160))
     assert np.abs(small[~outside].astype(int) - 127).max() < 20
+
+
+def test_what_an_orthoimage_was_made_from_is_known_while_it_is_there(tmp_path: Path) -> None:
+    file = tmp_path / "orthoimage.tif"
+    origin = origin_of("cloud", SETTINGS)
+    assert origin not in (origin_of("other", SETTINGS), origin_of("cloud", Settings(pixel_size_m=0.03)))
+    write_origin(file, origin)
+    assert read_origin(file) is None
+    file.write_bytes(b"")
+    assert read_origin(file) == origin
