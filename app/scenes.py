@@ -19,10 +19,11 @@ from app.scene3d import MAX_POINTS, CameraView, CloudView, DrapeView, GroundView
 from app.sites import Site
 from app.store import ProjectFolder, problem_of
 from core.camera import Pose
-from core.cloud import Cloud, height_at, pick, thin
+from core.cloud import Cloud, pick, thin
 from core.coordinates import Floats
 from core.errors import InputError
 from core.georeference import ReferenceFit
+from core.ground_plane import height_at
 from core.orthoimage import ORTHOIMAGE_FILE
 from core.project import Project
 from core.review import camera_at, camera_path, lines_at_rest, moved_lines

@@ -17,8 +17,9 @@ from app.errors import ApiError, NotYet
 from app.frames import Fingerprint, fingerprint
 from app.jobs import Jobs
 from app.store import CACHE_FOLDER, ProjectFolder, read_json
-from core.cloud import Cloud, GroundPlane, fit_ground_plane, read_cloud
+from core.cloud import Cloud, read_cloud
 from core.errors import InputError
+from core.ground_plane import GroundPlane, fit_ground_plane
 from core.progress import CancelToken, Progress
 from core.project import RESULTS_FOLDER, Project, read_project
 from core.relief import Relief

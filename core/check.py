@@ -13,10 +13,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from core.cloud import Cloud, fit_ground_plane, read_cloud
+from core.cloud import Cloud, read_cloud
 from core.coordinates import Floats
 from core.errors import InputError
 from core.georeference import ReferenceFit, fit_reference
+from core.ground_plane import fit_ground_plane
 from core.intervals import within
 from core.lens import Lens, read_lens, require_image_size
 from core.progress import Progress, silent

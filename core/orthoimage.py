@@ -13,9 +13,10 @@ import numpy as np
 import tifffile
 from numpy.typing import ArrayLike, NDArray
 
-from core.cloud import RELIEF_REACH_M, Cloud, GroundPlane
+from core.cloud import Cloud
 from core.coordinates import Bools, Floats, OrthoGrid, apply_homography, batches
 from core.errors import InputError
+from core.ground_plane import RELIEF_REACH_M, GroundPlane
 from core.lens import Lens
 from core.progress import Progress, silent
 from core.project import Orthoimage as Settings

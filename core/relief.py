@@ -17,8 +17,9 @@ import numpy as np
 from scipy.ndimage import map_coordinates, maximum_filter
 
 from core.camera import Pose, intersect_height
-from core.cloud import PASS_POINTS, RELIEF_REACH_M, Cloud, GroundPlane, ground_elevation
+from core.cloud import Cloud
 from core.coordinates import Bools, Floats, batches, read_only
+from core.ground_plane import PASS_POINTS, RELIEF_REACH_M, GroundPlane, ground_elevation
 from core.storage import write_atomically
 
 CELL_M = 0.25

@@ -16,11 +16,12 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from core.check import obstacles
-from core.cloud import Cloud, GroundPlane, fit_ground_plane, read_cloud
+from core.cloud import Cloud, read_cloud
 from core.coordinates import Floats, invert_homography
 from core.errors import InputError
 from core.export import Results, write_results
 from core.georeference import ReferenceFit
+from core.ground_plane import GroundPlane, fit_ground_plane
 from core.ground_poses import fit_with_relief
 from core.lens import Lens, read_lens, require_image_size
 from core.locks import take_lock

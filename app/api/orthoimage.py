@@ -16,10 +16,10 @@ from app.lumas import prepare_luma
 from app.reference import H_plan_und, coarser, grid_of_frame, reference_fit
 from app.sites import site_key
 from app.store import ProjectFolder, problem_of
-from core.cloud import height_at
 from core.coordinates import OrthoGrid
 from core.errors import InputError
 from core.georeference import ReferenceFit
+from core.ground_plane import height_at
 from core.orthoimage import rectify_frame
 from core.project import Project
 

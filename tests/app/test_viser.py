@@ -23,7 +23,8 @@ from app.scene3d import CLIENT_FILE, TOKEN_HEADER, CloudView, Scene3D, line_colo
 from app.scenes import _ground
 from app.sites import Site
 from core import figures
-from core.cloud import GroundPlane, make_cloud
+from core.cloud import make_cloud
+from core.ground_plane import GroundPlane
 
 HOST = {"Host": "127.0.0.1:8000"}
 ORIGIN = HOST | {"Origin": "http://127.0.0.1:8000"}

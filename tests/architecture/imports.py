@@ -28,6 +28,7 @@ ORDER = (
     "camera",
     "point_files",
     "cloud",
+    "ground_plane",
     "relief",
     "orthoimage",
     "georeference",

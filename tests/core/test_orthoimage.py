@@ -8,9 +8,10 @@ import pytest
 import tifffile
 
 from core.camera import Pose, plan_homography
-from core.cloud import Cloud, fit_ground_plane, make_cloud
+from core.cloud import Cloud, make_cloud
 from core.coordinates import OrthoGrid, apply_homography
 from core.errors import InputError
+from core.ground_plane import fit_ground_plane
 from core.lens import Lens
 from core.orthoimage import (
     MAX_FILL_M,

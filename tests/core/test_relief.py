@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from core.camera import Pose, project
-from core.cloud import fit_ground_plane, make_cloud
+from core.cloud import make_cloud
 from core.coordinates import Bools, Floats
 from core.errors import InputError
+from core.ground_plane import fit_ground_plane
 from core.project import Project
 from core.relief import Relief, rasterise
 from core.run import relief_plan
