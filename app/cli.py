@@ -13,7 +13,6 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -21,6 +20,7 @@ from typing import Any, NoReturn
 from app.terminal import TerminalProgress
 from core.errors import Cancelled, InputError
 from core.progress import CancelToken
+from core.version import program_version
 
 # The stages are imported by the command that needs them: `rooftrack --help` answers at once.
 
@@ -236,7 +236,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="rooftrack", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--version", action="version", version=f"rooftrack {_version()}")
+    parser.add_argument("--version", action="version", version=f"rooftrack {program_version()}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_run(commands)
     _add_check(commands)
@@ -330,13 +330,6 @@ def _add_serve(commands: argparse._SubParsersAction[_Parser]) -> None:
         "--port", type=_port, metavar="N", help="port to listen on (default 8000, or the next free one)"
     )
     parser.set_defaults(command=_serve)
-
-
-def _version() -> str:
-    try:
-        return version("rooftrack")
-    except PackageNotFoundError:
-        return "(not installed)"
 
 
 def _positive_number(text: str) -> int:

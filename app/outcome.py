@@ -28,10 +28,11 @@ from core.measurements import FrameMeasurement, MeasurementStore, Recording
 from core.prediction import MeasureSetup
 from core.project import Drift, Method, Project, Target, project_json
 from core.results import TargetHistory, read_history_csv
-from core.run import FRAMES_FILE, LoadedInputs, load_inputs, program_version, relief_plan
+from core.run import FRAMES_FILE, LoadedInputs, load_inputs, relief_plan
 from core.solution import Solution
 from core.solve import solve
 from core.storage import File
+from core.version import program_version
 from core.video import frame_index
 
 METHODS: tuple[Method, ...] = ("geometric", "paper")

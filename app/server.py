@@ -7,7 +7,6 @@ import logging
 import socket
 import sys
 from collections.abc import AsyncIterator, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -36,6 +35,7 @@ from app.steps import SETTLED, STEPS, steps_of
 from app.store import ProjectFolder, Workspace
 from core.errors import InputError
 from core.locks import take_lock
+from core.version import program_version
 
 STATIC = Path(__file__).resolve().parent.parent / "static"
 DEFAULT_PORT = 8000
@@ -135,7 +135,7 @@ def _add_pages(app: FastAPI) -> None:
     def about(here: Here) -> dict[str, Any]:
         """Return what this server is."""
         return {
-            "version": _version(),
+            "version": program_version(),
             "workspace": str(here.workspace.folder),
             "roots": [str(root) for root in here.places.roots],
         }
@@ -170,13 +170,6 @@ def _page(name: str) -> FileResponse:
     if not file.is_file():
         raise Missing(f"{name}: there is no such page.", path=name)
     return FileResponse(file, media_type="text/html", headers={"Cache-Control": "no-cache"})
-
-
-def _version() -> str:
-    try:
-        return version("rooftrack")
-    except PackageNotFoundError:
-        return "in development"
 
 
 class _Server(uvicorn.Server):

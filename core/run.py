@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -35,6 +34,7 @@ from core.relief import Relief, rasterise
 from core.solve import solve
 from core.storage import File, content_identity, file_at, opened, state_of, write_atomically
 from core.validation import GpsRecord, read_gps
+from core.version import program_version
 from core.video import VideoInfo, frame_index, probe
 
 FRAMES_FILE = "frames.sqlite"
@@ -350,11 +350,3 @@ def _digest(stream: BinaryIO) -> str:
     while block := stream.read(1 << 20):
         digest.update(block)
     return digest.hexdigest()
-
-
-def program_version() -> str:
-    """Return the installed version of Rooftrack."""
-    try:
-        return version("rooftrack")
-    except PackageNotFoundError:
-        return "not installed"

@@ -14,6 +14,7 @@ from pathlib import Path
 
 # The order in which data flows: a module imports only from those named before it.
 ORDER = (
+    "version",
     "errors",
     "progress",
     "coordinates",
