@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from app.errors import Invalid
+from core.cloud import CLOUD_SUFFIXES, TABLE_SUFFIXES
 from core.errors import InputError
 from core.lens import read_lens
 from core.validation import gps_columns
@@ -14,7 +15,6 @@ from core.video import probe
 
 # How each format of point clouds begins; the others are tables of numbers.
 _BEGINNINGS = {".las": b"LASF", ".laz": b"LASF", ".ply": b"ply", ".pcd": b"VERSION", ".e57": b"ASTM-E57"}
-_TABLES = (".xyz", ".pts", ".txt", ".csv", ".asc")
 _LOOKED_AT_BYTES = 4096
 _COORDINATES = 3
 
@@ -49,13 +49,12 @@ def _look_at_cloud(file: Path, name: str) -> None:
     suffix = Path(name).suffix.lower()
     with file.open("rb") as stream:
         head = stream.read(_LOOKED_AT_BYTES)
-    if suffix not in _BEGINNINGS and suffix not in _TABLES:
-        known = ", ".join([*_BEGINNINGS, *_TABLES])
-        raise InputError(f"{name}: is no point cloud; these end in {known}.")
+    if suffix not in CLOUD_SUFFIXES:
+        raise InputError(f"{name}: is no point cloud; these end in {', '.join(CLOUD_SUFFIXES)}.")
     if suffix in _BEGINNINGS and _BEGINNINGS[suffix] not in (head if suffix == ".pcd" else head[:8]):
         raise InputError(f"{name}: does not begin as a {suffix[1:].upper()} file does; export or copy it again.")
     lines = [_holds_a_point(line) for line in head.splitlines() if line.strip()]
-    if suffix in _TABLES and 2 * sum(lines) < len(lines):  # a header of a few lines is as it should be
+    if suffix in TABLE_SUFFIXES and 2 * sum(lines) < len(lines):  # a header of a few lines is as it should be
         raise InputError(f"{name}: is no table of points, one with its coordinates in a line; export the cloud again.")
 
 

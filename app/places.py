@@ -7,15 +7,18 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from app.errors import Missing, Refused
+from core.cloud import CLOUD_SUFFIXES
+from core.lens_calibration import IMAGE_SUFFIXES
 
+# What comes later wins: a table of numbers is taken for a GPS record.
 KINDS_BY_SUFFIX = {
     **dict.fromkeys((".mp4", ".mov", ".m4v", ".mkv", ".avi", ".mts", ".m2ts", ".ts", ".webm"), "video"),
-    **dict.fromkeys((".las", ".laz", ".ply", ".pcd", ".xyz", ".pts", ".e57"), "cloud"),
+    **dict.fromkeys(CLOUD_SUFFIXES, "cloud"),
     **dict.fromkeys((".yaml", ".yml", ".xml", ".json"), "lens"),
     **dict.fromkeys((".csv", ".txt"), "gps"),
-    **dict.fromkeys((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"), "image"),
+    **dict.fromkeys(IMAGE_SUFFIXES, "image"),
 }
-# A point cloud may be a table of numbers too, so these suffixes are offered for both.
+# It may be a point cloud too, so these suffixes are offered for both.
 SUFFIXES_OF_CLOUD_TABLES = (".csv", ".txt")
 
 

@@ -20,6 +20,9 @@ from core.errors import InputError
 from core.point_files import PointTable, read_pcd, read_ply, read_text
 from core.progress import Progress, silent
 
+# Tables of numbers; the others say what they are in their first bytes.
+TABLE_SUFFIXES = (".xyz", ".pts", ".txt", ".csv", ".asc")
+CLOUD_SUFFIXES = (".las", ".laz", ".ply", ".pcd", ".e57", *TABLE_SUFFIXES)
 _LAS_CHUNK_POINTS = 2_000_000
 # ASPRS classes of points that are no surface: low noise and high noise.
 _NOISE_CLASSES = (7, 18)
@@ -82,7 +85,7 @@ def read_cloud(path: Path | str, progress: Progress = silent) -> Cloud:
     path = Path(path)
     readers: dict[str, Callable[[Path, Progress], Cloud]] = {
         **dict.fromkeys((".las", ".laz"), _read_las),
-        **dict.fromkeys((".xyz", ".pts", ".txt", ".csv", ".asc"), lambda *a: _from_table(path, read_text(*a))),
+        **dict.fromkeys(TABLE_SUFFIXES, lambda *a: _from_table(path, read_text(*a))),
         ".ply": lambda *a: _from_table(path, read_ply(*a)),
         ".pcd": _read_pcd,
         ".e57": _read_e57,
@@ -90,7 +93,7 @@ def read_cloud(path: Path | str, progress: Progress = silent) -> Cloud:
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise InputError(
-            f"{path}: point clouds end in {', '.join(readers)}, not in {path.suffix or 'nothing'}; "
+            f"{path}: point clouds end in {', '.join(CLOUD_SUFFIXES)}, not in {path.suffix or 'nothing'}; "
             "export it in one of these formats."
         )
     try:

@@ -18,6 +18,8 @@ import uvicorn
 
 from app.context import Context
 from app.server import create_app
+from core.cloud import CLOUD_SUFFIXES
+from core.lens_calibration import IMAGE_SUFFIXES
 from core.video import frame_index
 from tests.app.conftest import ADDRESS, WRITE, TestClient
 
@@ -370,3 +372,13 @@ def test_an_address_that_is_typed_is_kept_as_it_is(client: TestClient, workspace
     refused = typed("file:///etc/hostname")
     assert (refused.status_code, "name it by its path" in refused.json()["error"]["message"]) == (403, True)
     assert typed(str(workspace / "small" / "video.mp4")).json()["project"]["inputs"]["video"] == "video.mp4"
+
+
+@pytest.mark.parametrize(("kind", "suffixes"), [("cloud", CLOUD_SUFFIXES), ("image", IMAGE_SUFFIXES)])
+def test_every_file_that_the_engine_reads_may_be_chosen(
+    client: TestClient, workspace: Path, kind: str, suffixes: tuple[str, ...]
+) -> None:
+    for suffix in suffixes:
+        (workspace / f"a{suffix}").touch()
+    seen = client.get("/api/browse", params={"dir": str(workspace), "kind": kind}).json()["entries"]
+    assert {f"a{suffix}" for suffix in suffixes} <= {entry["name"] for entry in seen}
