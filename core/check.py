@@ -15,6 +15,7 @@ import numpy as np
 
 from core.cloud import Cloud, read_cloud
 from core.coordinates import Floats
+from core.drift import corner_obstacle
 from core.errors import InputError
 from core.georeference import ReferenceFit, fit_reference
 from core.ground_plane import fit_ground_plane
@@ -112,15 +113,10 @@ def _time_obstacles(project: Project, index: FrameIndex) -> Iterator[str]:
                 f"intervals_s.{name}: [{interval[0]:g}, {interval[1]:g}] holds no frame of the video, which lasts from "
                 f"0 to {times_s[-1]:.3f} s; correct it"
             )
-    if project.drift.filter == "high-pass" and frames > 1:
-        corner_hz, nyquist_hz = project.drift.corner_hz, 0.5 / float(np.median(np.diff(times_s)))
-        if corner_hz >= nyquist_hz:
-            yield f"drift.corner_hz: {corner_hz:g} is not below {nyquist_hz:g} Hz, half the frame rate; lower it"
-        elif corner_hz * times_s[-1] < 0.5:
-            yield (
-                f"drift.corner_hz: {corner_hz:g}, but the video lasts {times_s[-1]:.1f} s, less than half a period; "
-                f"choose more than {0.5 / times_s[-1]:.2f} Hz"
-            )
+    if project.drift.filter == "high-pass":
+        obstacle = corner_obstacle(project.drift.corner_hz, times_s)
+        if obstacle is not None:
+            yield obstacle
 
 
 def _problems_of_file(file: Path) -> list[str]:

@@ -28,6 +28,8 @@ SWEEP_CORNERS_HZ = tuple((0.05 + 0.025 * np.arange(19)).round(3).tolist())
 ACCEPTABLE_PRE_EVENT_RMS_M = 0.01
 # Millisecond timestamps scatter by 3 % of a frame at 60 frames a second; below this a record counts as even.
 _EVEN_WITHIN_FRAMES = 0.1
+# Frames that a filter or a spectrum needs.
+LEAST_FRAMES = 4
 AXIS_NAMES = ("x (east)", "y (north)")
 
 
@@ -169,6 +171,35 @@ def corner_sweep(
     corners = np.asarray(corners_hz, dtype=np.float64)
     total = np.sqrt(np.nansum(rms[usable] ** 2, axis=1))
     return CornerSweep(read_only(corners), read_only(rms), _knee(corners[usable], total))
+
+
+def corner_obstacle(corner_hz: float, time_s: ArrayLike) -> str | None:
+    """Return what keeps frames at these times from being filtered at a corner, a sentence without its end; or None.
+
+    Args:
+        time_s: (F,) increasing.
+    """
+    times = np.asarray(time_s, dtype=np.float64)
+    if len(times) < LEAST_FRAMES:
+        return _too_few(len(times))
+    grid_s = _even_times(times)
+    rate_hz = 1 / _step(grid_s)
+    duration_s = len(grid_s) / rate_hz
+    if not 0 < corner_hz < rate_hz / 2:
+        return (
+            f"drift.corner_hz: {corner_hz:g} Hz is not between 0 and half the frame rate ({rate_hz / 2:g} Hz); "
+            "choose a lower corner"
+        )
+    if duration_s * corner_hz < 0.5:
+        return (
+            f"drift.corner_hz: the record lasts {duration_s:.1f} s, less than half a period of {corner_hz:g} Hz; "
+            f"choose a corner above {0.5 / duration_s:.2f} Hz or a longer video"
+        )
+    return None
+
+
+def _too_few(frames: int) -> str:
+    return f'drift.filter: the record has {frames} frames, but a filter needs at least {LEAST_FRAMES}; choose "none"'
 
 
 def filter_warnings(
@@ -318,26 +349,15 @@ class _Record:
 
     @classmethod
     def of(cls, columns: Floats, times: Floats) -> _Record:
-        if len(times) < 4:
-            raise InputError(f"The record has {len(times)} frames; a filter needs at least four.")
+        if len(times) < LEAST_FRAMES:
+            raise InputError(f"{_too_few(len(times))}.")
         grid_s, grid = _on_even_grid(_bridged(columns, times), times)
         return cls(columns, times, grid, grid_s, even=grid_s is times)
 
     def problem_with(self, corner_hz: float) -> str | None:
         """Say why this record cannot be filtered at this corner, if so."""
-        rate_hz = 1 / _step(self.grid_s)
-        duration_s = len(self.grid_s) / rate_hz
-        if not 0 < corner_hz < rate_hz / 2:
-            return (
-                f"drift.corner_hz: {corner_hz:g} Hz is not between 0 and half the frame rate ({rate_hz / 2:g} Hz); "
-                "choose a lower corner."
-            )
-        if duration_s * corner_hz < 0.5:
-            return (
-                f"drift.corner_hz: the record lasts {duration_s:.1f} s, less than half a period of {corner_hz:g} Hz; "
-                f"choose a corner above {0.5 / duration_s:.2f} Hz or a longer video."
-            )
-        return None
+        obstacle = corner_obstacle(corner_hz, self.grid_s)
+        return None if obstacle is None else f"{obstacle}."
 
     def slow_part(self, corner_hz: float, order: int) -> Floats:
         """(G, K) what the high-pass takes away."""
@@ -375,13 +395,20 @@ def _bridged(columns: Floats, times: Floats) -> Floats:
     return bridged
 
 
-def _on_even_grid(columns: Floats, times: Floats) -> tuple[Floats, Floats]:
-    """Return times and values on an even grid: what was given where it is even, else resampled to the median rate."""
+def _even_times(times: Floats) -> Floats:
+    """Return the times where they are even, else an even grid (G,) over them at the median rate."""
     even = np.linspace(times[0], times[-1], len(times))
     if np.abs(times - even).max() < _EVEN_WITHIN_FRAMES * _step(even):
-        return times, columns
+        return times
     step = float(np.median(np.diff(times)))
-    grid_s = np.arange(times[0], times[-1] + step / 2, step)
+    return np.arange(times[0], times[-1] + step / 2, step)
+
+
+def _on_even_grid(columns: Floats, times: Floats) -> tuple[Floats, Floats]:
+    """Return times and values on an even grid: what was given where it is even, else resampled to the median rate."""
+    grid_s = _even_times(times)
+    if grid_s is times:
+        return times, columns
     resampled = [np.interp(grid_s, times, columns[:, column]) for column in range(columns.shape[1])]
     return grid_s, np.stack(resampled, axis=1)
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from core.check import check_project
+from core.drift import corner_obstacle, high_pass
+from core.errors import InputError
 from core.lens import Lens, write_lens
 from tests import small_project
 
@@ -77,8 +81,14 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
         (put([-2, 1.9], "targets", 0, "lines", "T1", "from_m"), "L1 and T1 run nearly the same way"),
         (put([1.0, 5.0], "intervals_s", "residual"), "intervals_s.residual: [1, 5] reaches outside the video"),
         (put([0.51, 0.54], "intervals_s", "pre_event"), "intervals_s.pre_event: [0.51, 0.54] holds no frame"),
-        (put({"filter": "high-pass", "corner_hz": 10}, "drift"), "drift.corner_hz: 10 is not below 10 Hz"),
-        (put({"filter": "high-pass", "corner_hz": 0.1}, "drift"), "less than half a period; choose more than 0.26 Hz"),
+        (
+            put({"filter": "high-pass", "corner_hz": 10}, "drift"),
+            "drift.corner_hz: 10 Hz is not between 0 and half the frame rate (10 Hz)",
+        ),
+        (
+            put({"filter": "high-pass", "corner_hz": 0.1}, "drift"),
+            "less than half a period of 0.1 Hz; choose a corner above 0.25 Hz",
+        ),
         (
             put(20, "targets", 0, "height_m"),
             "height_m: 20, but by the clicks the camera hovers 15.0 m above",
@@ -96,6 +106,15 @@ def test_each_contradiction_is_told_in_one_line(inputs: Path, change: Change, to
     assert any(told in line for line in found), found
     assert all("\n" not in line and line.endswith(".") for line in found)
     assert all(line.startswith(str(inputs)) for line in found)
+
+
+def test_a_corner_is_told_in_the_words_of_the_filter_before_anything_is_measured(inputs: Path) -> None:
+    """Whoever waits for the filter itself to refuse has measured the whole video first."""
+    (line,) = problems(inputs, put({"filter": "high-pass", "corner_hz": 0.1}, "drift"))
+    obstacle = corner_obstacle(0.1, np.arange(small_project.FRAMES) / small_project.RATE_HZ)
+    assert line == f"{inputs / 'project.json'}: {obstacle}."
+    with pytest.raises(InputError, match=re.escape(obstacle or "")):
+        high_pass(np.zeros(small_project.FRAMES), np.arange(small_project.FRAMES) / small_project.RATE_HZ, 0.1)
 
 
 def test_all_problems_are_told_at_once(inputs: Path) -> None:
