@@ -305,16 +305,16 @@ def _draw(results: Results, check: GpsCheck | None, progress: Progress) -> dict[
     """Return every figure by the name of its file, each target's under the target's name."""
     from core import figures  # takes a second to import, which commands that draw nothing should not wait for
 
-    solution, project_ = results.solution, results.project
-    luma = read_frame(results.video, project_.reference_frame).luma
+    solution, decided = results.solution, results.project
+    luma = read_frame(results.video, decided.reference_frame).luma
     drawn = {}
-    for target in project_.targets:
+    for target in decided.targets:
         checked = check if check is not None and check.target == target.name else None
         drawn[f"{target.name}-tracked"] = _tracked_figure(results, target, luma)
         for name, figure in figures.target_figures(
             solution.histories[target.name],
-            project_.intervals_s,
-            project_.drift,
+            decided.intervals_s,
+            decided.drift,
             comparison=None if checked is None else checked.comparison,
             antenna_m=None if checked is None else checked.moved_m,
         ).items():

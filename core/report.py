@@ -245,7 +245,8 @@ def _method(project: Project) -> str:
         text = (
             "The published method: each frame is undistorted, registered to the reference frame by matched ground "
             "features and a homography, and orthorectified onto the LiDAR ground. Edge point pairs of the lines L1, L2 "
-            "and T1 give the intersections P1 and P2, whose known distance sets the scale; their rigid motion is the "
+            "and T1 give the intersections P1 and P2; their known distance, or else the target's height, sets the "
+            "scale, and their rigid motion is the "
             "displacement. The homography holds the ground still, not the roof: camera drift remains in the result as "
             "apparent motion."
         )
