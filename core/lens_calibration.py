@@ -190,7 +190,7 @@ def calibrate_images(images: Iterable[tuple[str, Luma]], board: tuple[int, int],
     if size is None:
         raise InputError("no pictures of a checkerboard were given; give 10 to 30, tilted, to the edges of the image.")
     views, fit = _fitted(_without_blurred(views, board), (size[1], size[0]), board, square_m)
-    return _judged(views, fit, size=(size[1], size[0]), board=board, square_m=square_m)
+    return _judged(views, fit, (size[1], size[0]), board, square_m)
 
 
 def images_of(
@@ -390,7 +390,7 @@ def _first_guess(places: NDArray[np.float32], corners: list[Floats], size: tuple
 
 
 def _judged(
-    views: list[View], fit: _Fit, *, size: tuple[int, int], board: tuple[int, int], square_m: float
+    views: list[View], fit: _Fit, size: tuple[int, int], board: tuple[int, int], square_m: float
 ) -> Calibration:
     """Put together the lens, its uncertainty and what a person should know."""
     corners = np.concatenate([_corners(view) for view in views if not view.left_out])
