@@ -16,6 +16,7 @@ from pathlib import Path
 ORDER = (
     "errors",
     "progress",
+    "parallel",
     "coordinates",
     "robust",
     "storage",
