@@ -9,7 +9,7 @@ from __future__ import annotations
 import sqlite3
 import threading
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from core.project import Drift, Method, Project, Target, project_json
 from core.results import TargetHistory, read_history_csv
 from core.run import FRAMES_FILE, LoadedInputs, load_inputs, relief_plan
 from core.solution import Solution
-from core.solve import solve
+from core.solve import solve, with_histories
 from core.storage import File
 from core.version import program_version
 from core.video import frame_index
@@ -223,13 +223,16 @@ class Outcomes:
         recorded = recorded_of(folder, project, chosen)
         if recorded.frames < 2:
             raise NotYet("Nothing has been measured yet with these bands and regions; track first.", path="track")
-        key = (folder.id, chosen, recorded, _without_name(project), _stamps(folder, project))
+        wanted = by_method(project, chosen)
+        alike = (folder.id, chosen, recorded, _but_filter(wanted), _stamps(folder, project))
         with self._one_at_a_time(folder.id):
             with self._lock:
-                found = self._solved.get(key)
+                kept = {key: found for key, found in self._solved.items() if key[0] == alike}
+            found = kept.get((alike, wanted.drift))
             if found is None:
-                found = _solve(folder, project, chosen)
-                self._keep(self._solved, key, found)
+                # Filtering a known motion anew is a moment's work; solving ten minutes of video is not.
+                found = _filtered(next(iter(kept.values())), wanted) if kept else _solve(folder, wanted)
+                self._keep(self._solved, (alike, wanted.drift), found)
         return found
 
     def history(
@@ -287,16 +290,22 @@ class Outcomes:
             return self._locks.setdefault(project_id, threading.Lock())
 
 
-def _solve(folder: ProjectFolder, project: Project, method: Method) -> Solved:
-    inputs = loaded(folder, by_method(project, method))
-    wanted = _wanted(fingerprint(folder.require_video(project)), inputs.project)
+def _solve(folder: ProjectFolder, project: Project) -> Solved:
+    inputs = loaded(folder, project)
+    wanted = _wanted(fingerprint(folder.require_video(project)), project)
     with MeasurementStore(folder.results / FRAMES_FILE) as store:
-        number = store.find(method, wanted)
+        number = store.find(project.method, wanted)
         if number is None:
             raise NotYet("Nothing has been measured yet with these bands and regions; track first.", path="track")
         recording = store.load(number)
     solution = solve(recording, inputs.project, inputs.lens, inputs.relief, has_lens=inputs.has_lens)
     return Solved(inputs, wanted, recording, solution)
+
+
+def _filtered(found: Solved, project: Project) -> Solved:
+    """Return what was solved with the filter of a project that differs in nothing else."""
+    inputs = replace(found.inputs, project=project)
+    return replace(found, inputs=inputs, solution=with_histories(found.solution, project))
 
 
 def by_method(project: Project, method: Method) -> Project:
@@ -350,8 +359,9 @@ def _results_of(folder: ProjectFolder, project: Project, found: Solved) -> Resul
     )
 
 
-def _without_name(project: Project) -> str:
-    return project_json(project.model_copy(update={"name": "-"}))
+def _but_filter(project: Project) -> str:
+    """Return what a project says, but for its name and the filter of the drift."""
+    return project_json(project.model_copy(update={"name": "-", "drift": Drift()}))
 
 
 def _stamps(folder: ProjectFolder, project: Project) -> tuple[Any, ...]:

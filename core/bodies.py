@@ -20,6 +20,7 @@ from core.motion import (
     rigid_from_points,
     rigid_with_weights,
 )
+from core.parallel import on_all_cores
 from core.robust import finite_median
 
 # Frames fitted at a time; what scatter is usual is told from them.
@@ -66,15 +67,16 @@ class RestBody:
 
     def _fit(self, points: Floats, pattern: Floats | None) -> RigidFit:
         """Fit some frames at a time, since a fit takes many times the memory of its points."""
-        fits = []
-        for batch in batches(len(points), BATCH):
+
+        def fit(batch: slice) -> RigidFit:
             some = points[batch]
             weight = np.ones(some.shape[:-1])
             if self.lines is not None:
-                fits.append(rigid_from_lines(some, weight, self.lines, pattern=pattern))
-            else:
-                assert self.points is not None
-                fits.append(rigid_from_points(some, weight, self.points, self.centre))
+                return rigid_from_lines(some, weight, self.lines, pattern=pattern)
+            assert self.points is not None
+            return rigid_from_points(some, weight, self.points, self.centre)
+
+        fits = on_all_cores(fit, batches(len(points), BATCH))
         columns = zip(*([getattr(fit, each.name) for each in fields(fit)] for fit in fits), strict=True)
         return RigidFit(*(np.concatenate(column) for column in columns))
 

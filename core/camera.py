@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.coordinates import Floats, batches, finite_rows
+from core.parallel import on_all_cores
 from core.robust import TUKEY, robust_sigma
 
 # Frames solved together: bounds the memory of the normal equations to some tens of MB at 500 points a frame.
@@ -131,16 +132,23 @@ def jacobians(R: Floats, centre_m: Floats, points_m: Floats) -> tuple[Floats, Fl
 
     The rotation is perturbed on the left, R <- exp(omega) R; the centre additively, in world metres.
     """
-    camera = (points_m - centre_m[:, None, :]) @ np.swapaxes(R, -1, -2)
-    inverse_z = 1.0 / camera[..., 2]
-    a, b = camera[..., 0] * inverse_z, camera[..., 1] * inverse_z
-    J = np.empty((*a.shape, 2, 6))
-    J[..., 0, 0], J[..., 0, 1], J[..., 0, 2] = -a * b, 1 + a * a, -b
-    J[..., 1, 0], J[..., 1, 1], J[..., 1, 2] = -(1 + b * b), a * b, a
-    rows = R[:, None, :, :]
-    J[..., 0, 3:] = (a[..., None] * rows[..., 2, :] - rows[..., 0, :]) * inverse_z[..., None]
-    J[..., 1, 3:] = (b[..., None] * rows[..., 2, :] - rows[..., 1, :]) * inverse_z[..., None]
-    return np.stack([a, b], axis=-1), J
+    rays, J = _derivatives(R, centre_m, points_m)
+    return rays.transpose(0, 2, 1), J.transpose(0, 3, 2, 1)
+
+
+def _derivatives(R: Floats, centre_m: Floats, points_m: Floats) -> tuple[Floats, Floats]:
+    """Return rays (F, 2, N) and derivatives (F, 6, 2, N) as `jacobians`: points last, as they lie in memory best."""
+    camera = R @ (points_m.T - centre_m[:, :, None])
+    inverse_z = 1.0 / camera[:, 2:]
+    rays = camera[:, :2] * inverse_z
+    a, b = rays[:, 0], rays[:, 1]
+    J = np.empty((len(R), 6, *rays.shape[1:]))
+    J[:, 1, 1] = a * b
+    J[:, 0, 0], J[:, 1, 0], J[:, 2, 0] = -J[:, 1, 1], 1.0 + a * a, -b
+    J[:, 0, 1], J[:, 2, 1] = -(1.0 + b * b), a
+    for row in range(2):
+        J[:, 3:, row] = (rays[:, row, None] * R[:, 2, :, None] - R[:, row, :, None]) * inverse_z
+    return rays, J
 
 
 def fit_poses(
@@ -175,13 +183,14 @@ def fit_poses(
     unknowns = 3 if fixed_centre_m is not None else 6
     weight = np.where(finite_rows(points_m), weight, 0.0)
     points_m = np.nan_to_num(points_m)
-    parts = [
-        _fit_batch(
+
+    def fit(s: slice) -> tuple[Floats, ...]:
+        return _fit_batch(
             rays[s], weight[s], points_m, R0[s], C0[s],
             iterations=iterations, robust=robust, sigma_floor=sigma_floor, unknowns=unknowns,
-        )
-        for s in batches(frames, BATCH)
-    ]  # fmt: skip
+        )  # fmt: skip
+
+    parts = on_all_cores(fit, batches(frames, BATCH))
     return PoseFit(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
@@ -198,12 +207,12 @@ def _fit_batch(
     unknowns: int,
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     seen = finite_rows(rays) & (weight > 0)
-    observed = np.where(seen[..., None], rays, 0.0)
+    observed = np.where(seen[:, None], rays.transpose(0, 2, 1), 0.0)
     base = np.where(seen, weight, 0.0)
     used, sigma = base, np.full(len(rays), sigma_floor)
-    root = np.sqrt(base)[..., None]
+    root = np.sqrt(base)[:, None]
     for iteration in range(iterations):
-        predicted, J = jacobians(R, C, points_m)
+        predicted, J = _derivatives(R, C, points_m)
         residual = observed - predicted
         if robust:
             # Of a point that is known to be good, little is already too much.
@@ -211,25 +220,26 @@ def _fit_batch(
             # A wide funnel first, so that a poor start does not throw good points out.
             funnel = 4.0 if iteration < 2 else 1.0
             used = base * _tukey(root * residual, funnel * sigma)
-        A, g = _normal(J[..., :unknowns], residual, used)
+        A, g = _normal(J[:, :unknowns], residual, used)
         step = _solve_damped(A, g)
         R = exponential(step[:, :3]) @ R
         if unknowns == 6:
             C = C + step[:, 3:]
         if np.abs(step).max(initial=0.0) < 1e-12:
             break
-    predicted, J = jacobians(R, C, points_m)
-    residual = np.where(seen[..., None], observed - predicted, np.nan)
+    predicted, J = _derivatives(R, C, points_m)
+    residual = np.where(seen[:, None], observed - predicted, np.nan)
     normal, _ = _normal(J, np.zeros_like(observed), used)
-    return R, C, residual, used, normal, np.maximum(_sigma_seen(residual, used > 0), sigma_floor)
+    sigma = np.maximum(_sigma_seen(residual, used > 0), sigma_floor)
+    return R, C, residual.transpose(0, 2, 1), used, normal, sigma
 
 
 def _normal(J: Floats, residual: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    frames, points, _, unknowns = J.shape
-    flat = J.reshape(frames, points * 2, unknowns)
-    weighted = (J * weight[..., None, None]).reshape(frames, points * 2, unknowns)
-    transposed = np.swapaxes(weighted, -1, -2)
-    return transposed @ flat, (transposed @ residual.reshape(frames, points * 2, 1))[..., 0]
+    """Return normal matrices (F, U, U) and right sides (F, U) of derivatives (F, U, 2, N), residuals (F, 2, N)."""
+    frames, unknowns = J.shape[:2]
+    weighted = (J * weight[:, None, None]).reshape(frames, unknowns, -1)
+    A = weighted @ J.reshape(frames, unknowns, -1).swapaxes(1, 2)
+    return A, (weighted @ residual.reshape(frames, -1, 1))[..., 0]
 
 
 def _solve_damped(A: Floats, g: Floats) -> Floats:
@@ -243,11 +253,12 @@ def _solve_damped(A: Floats, g: Floats) -> Floats:
 
 
 def _sigma_seen(residual: Floats, seen: NDArray[np.bool_]) -> Floats:
-    """Return each frame's robust standard deviation (F,) of one coordinate of the residuals (F, N, 2) that are seen."""
-    return robust_sigma(np.where(seen[..., None], residual, np.nan).reshape(len(residual), -1))
+    """Return each frame's robust standard deviation (F,) of one coordinate of the residuals (F, 2, N) that are seen."""
+    return robust_sigma(np.where(seen[:, None], residual, np.nan).reshape(len(residual), -1))
 
 
 def _tukey(residual: Floats, sigma: Floats) -> Floats:
+    """Return the weights (F, N) of residuals (F, 2, N)."""
     # Two coordinates together: the median of a Rayleigh variable is 1.18 sigma, so the cut keeps its meaning per axis.
-    ratio = (residual**2).sum(axis=-1) / (2.0 * (TUKEY * sigma[:, None]) ** 2)
+    ratio = (residual**2).sum(axis=1) / (2.0 * (TUKEY * sigma[:, None]) ** 2)
     return np.where(ratio < 1.0, (1.0 - np.minimum(ratio, 1.0)) ** 2, 0.0)

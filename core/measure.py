@@ -23,10 +23,11 @@ from core.errors import InputError
 from core.following import CONFIRM_EVERY, PointsFollower, make_follower
 from core.ground import FEATURES, GroundTracker, View, choose_features, ground_mask
 from core.measurements import FrameMeasurement, MeasurementStore, Reference
+from core.parallel import available_cores
 from core.patches import PatchTracker, Singles
 from core.prediction import MeasureSetup, nothing_measured, predict_apparent, predict_homography
 from core.progress import CancelToken, Progress, silent
-from core.video import Frame, FrameIndex, FramesAhead, Luma, available_cores, frame_index, read_frames
+from core.video import Frame, FrameIndex, FramesAhead, Luma, frame_index, read_frames
 from core.workers import Helpers, Order
 
 # So many frames after the reference frame an encoder no longer repeats it; where they correlate with it by less than

@@ -16,7 +16,8 @@ from core.robust import biweight, finite_median, robust_sigma
 ITERATIONS = 8
 # Plain Gauss-Newton doubles the right digits each time; rotations are fractions of a degree.
 PLAIN_ITERATIONS = 4
-ROUGH_ITERATIONS = 2
+# Added to normal matrices of unit diagonal: what points do not tell stays where it was.
+RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -225,7 +226,7 @@ def rough_rigid_from_lines(points: Floats, lines: LineSet, shift: Floats, rotati
 
     Args:
         points: (L, K, 2) mid-line points, nan where not measured; K is even.
-        shift, rotation_rad: predicted, where the search starts.
+        shift, rotation_rad: predicted, where the one step begins.
 
     Returns:
         The motion with F = 1; its normal matrix is singular where the lines do not fix it.
@@ -234,16 +235,15 @@ def rough_rigid_from_lines(points: Floats, lines: LineSet, shift: Floats, rotati
     seen = finite_rows(points)[None]
     x = np.where(seen[..., None], points - lines.centre, 0.0)
     target = np.broadcast_to(lines.offset[:, None], (count, stations))
+    move, angle = shift[None], np.array([rotation_rad])
+    residual, J = _line_residual(x, move, angle, lines.normal, target)
+    residual = np.where(seen, residual, np.nan)
+    middle = finite_median(residual.reshape(1, 2 * count, -1))
     weight = seen.reshape(1, 2 * count, -1).sum(axis=-1).astype(np.float64)
-    move, angle = shift[None].copy(), np.array([rotation_rad])
-    residual, normal = np.zeros(seen.shape), np.zeros((1, 3, 3))
-    for _ in range(ROUGH_ITERATIONS):
-        residual, J = _line_residual(x, move, angle, lines.normal, target)
-        middle = finite_median(np.where(seen, residual, np.nan).reshape(1, 2 * count, -1))
-        J_half = np.where(seen[..., None], J, 0.0).reshape(1, 2 * count, -1, 3).sum(axis=2)
-        normal, step = _gauss_newton(J_half / np.maximum(weight, 1.0)[..., None], middle, weight)
-        move, angle = move + step[:, :2], angle + step[:, 2]
-    return RigidFit(move, angle, np.where(seen, residual, np.nan), seen.astype(np.float64), normal, np.ones((1, count)))
+    J_half = np.where(seen[..., None], J, 0.0).reshape(1, 2 * count, -1, 3).sum(axis=2)
+    normal, step = _gauss_newton(J_half / np.maximum(weight, 1.0)[..., None], middle, weight)
+    used = seen.astype(np.float64)
+    return RigidFit(move + step[:, :2], angle + step[:, 2], residual, used, normal, np.ones((1, count)))
 
 
 def _line_residual(x: Floats, shift: Floats, angle: Floats, normal: Floats, target: Floats) -> tuple[Floats, Floats]:
@@ -336,7 +336,7 @@ def _gauss_newton(J: Floats, residual: Floats, weight: Floats) -> tuple[Floats, 
     scale = np.sqrt(np.maximum(np.diagonal(A, axis1=1, axis2=2), 1e-300))
     scaled = A / (scale[:, :, None] * scale[:, None, :])
     b = (weighted @ r[..., None])[..., 0] / scale
-    step = (np.linalg.pinv(scaled, rcond=1e-9, hermitian=True) @ b[..., None])[..., 0] / scale
+    step = np.linalg.solve(scaled + RIDGE * np.eye(unknowns), b[..., None])[..., 0] / scale
     return A, np.where(np.isfinite(step), step, 0.0)
 
 

@@ -14,11 +14,12 @@ BY_MEDIAN = 1.4826
 
 def finite_median(values: Floats) -> Floats:
     """Return the median of what is finite along the last axis; 0 where nothing is. Quicker than numpy's own."""
-    ordered = np.sort(np.where(np.isfinite(values), values, np.inf), axis=-1)
-    count = np.isfinite(ordered).sum(axis=-1, keepdims=True)
-    low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=-1)
-    high = np.take_along_axis(ordered, np.minimum(count // 2, ordered.shape[-1] - 1), axis=-1)
-    return np.asarray(np.where(count > 0, 0.5 * (low + high), 0.0)[..., 0])
+    size = values.shape[-1]
+    ordered = np.sort(np.where(np.isfinite(values), values, np.inf), axis=-1).reshape(-1, size)
+    count = np.isfinite(ordered).sum(axis=-1)
+    row = np.arange(len(ordered))
+    middle = 0.5 * (ordered[row, np.maximum(count - 1, 0) // 2] + ordered[row, np.minimum(count // 2, size - 1)])
+    return np.where(count > 0, middle, 0.0).reshape(values.shape[:-1])
 
 
 def robust_sigma(residual: Floats) -> Floats:

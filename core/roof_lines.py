@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from core.coordinates import Floats
 from core.errors import InputError
+from core.robust import finite_median
 from core.video import Luma
 
 Singles = NDArray[np.float32]
@@ -200,7 +201,7 @@ class LineTracker:
         middle = np.add.reduceat(fraction, first) / count
         columns = section.half + np.rint(middle).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
         mean = np.add.reduceat(section.values, first, axis=0, dtype=np.float64) / count[:, None]
-        windows = np.take_along_axis(mean, np.clip(columns, 0, mean.shape[1] - 1), axis=1)
+        windows = mean[np.arange(QUARTERS)[:, None], np.clip(columns, 0, mean.shape[1] - 1)]
         scores = _correlations(windows, signature)
         score = _median_of_quarters(scores)
         shifts = np.arange(-search, search + 1)
@@ -236,7 +237,7 @@ class _Strip:
         count = members.sum(axis=1)
         filled = np.maximum(count, 1e-9)
         along, middle = members @ self.section.along / filled, members @ self.line / filled
-        wanted = 0.5 * np.median(count[count > 0])
+        wanted = 0.5 * finite_median(np.where(count > 0, count, np.nan))
         good = (count >= wanted) & (np.abs(shift) < profile.capture_px) & (strength > 0.25 * profile.edge)
         found = np.full((STATIONS, 2, 2), np.nan)
         found[..., axis] = np.where(good, along, np.nan).T

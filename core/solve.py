@@ -40,14 +40,21 @@ def solve(
     else:
         solution = solve_geometric(recording, project, lens, relief)
     contradiction = solution.reference.contradiction
-    return replace(
-        solution,
-        warnings=(*([f"{contradiction}."] if contradiction else []), *solution.warnings),
-        histories={
-            target.name: filtered(unfiltered_history(solution, target, project.intervals_s), project.drift)
-            for target in project.targets
-        },
-    )
+    warnings = (*([f"{contradiction}."] if contradiction else []), *solution.warnings)
+    return with_histories(replace(solution, warnings=warnings), project)
+
+
+def with_histories(solution: Solution, project: Project) -> Solution:
+    """Return a solution with the histories that the project's filter makes of it; quick beside solving.
+
+    Raises:
+        InputError: the record is too short for the corner frequency.
+    """
+    histories = {
+        target.name: filtered(unfiltered_history(solution, target, project.intervals_s), project.drift)
+        for target in project.targets
+    }
+    return replace(solution, histories=histories)
 
 
 def unfiltered_history(solution: Solution, target: Target, intervals: Intervals) -> TargetHistory:

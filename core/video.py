@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import itertools
-import os
 import queue
 import sys
 import threading
@@ -30,6 +29,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from core.errors import InputError
+from core.parallel import available_cores
 from core.storage import File, FileState, opened, state_of
 
 Luma = NDArray[np.uint8]
@@ -407,11 +407,6 @@ def _seek(container: InputContainer, stream: VideoStream, index: FrameIndex, sta
     keys = [tick for tick in index.key_ticks if tick <= index.ticks[start]]
     if keys:
         container.seek(keys[-1], stream=stream, backward=True)
-
-
-def available_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def luma_of(picture: VideoFrame) -> Luma:

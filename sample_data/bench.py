@@ -36,10 +36,11 @@ from core.following import LinesFollower
 from core.ground import GroundTracker
 from core.measure import PreparedVideo, make_measurer, measure, measure_chunk, measure_order
 from core.measurements import MeasurementStore
+from core.parallel import available_cores
 from core.run import FRAMES_FILE, load_inputs, run_project
 from core.solve import solve
 from core.storage import state_of
-from core.video import available_cores, frame_index, luma_of, read_frame, read_frames
+from core.video import frame_index, luma_of, read_frame, read_frames
 from core.workers import Order
 from sample_data.catalogue import SCENES, compose
 from sample_data.published import PublishedMethod

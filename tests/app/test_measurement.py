@@ -20,7 +20,9 @@ from app.jobs import JOB_FILE
 from app.outcome import recorded_of
 from app.server import create_app
 from core.lens import Lens, write_lens
+from core.project import Drift
 from core.results import CSV_HEADER
+from core.solve import filtered
 from tests.app.conftest import ADDRESS, WRITE, TestClient
 from tests.app.measured import FOCAL_PX, SIZE, displacement_m, write_measurable
 from tests.scenes.clips import measured_history
@@ -144,6 +146,23 @@ def test_a_changed_project_makes_files_stale_and_is_solved_at_once(tracked: Test
     finally:
         tracked.post(f"{CLIP}/undo", json={"revision": changed["revision"]})
     assert not tracked.get(f"{CLIP}/results").json()["stale"]
+
+
+def test_another_filter_of_a_motion_that_is_known_is_not_solved_anew(
+    tracked: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context: Context = tracked.app.state.context  # type: ignore[attr-defined]
+    folder = context.workspace.open("clip")
+    project = folder.load().project
+    filters = [Drift(filter="high-pass", corner_hz=0.5, order=2), Drift(filter="high-pass", corner_hz=0.7, order=2)]
+    motion = context.outcomes.solved(folder, project).solution.histories["roof"].p1_m
+    monkeypatch.setattr("app.outcome.solve", lambda *_, **__: pytest.fail("solved anew"))
+    for chosen in (*filters, project.drift):
+        found = context.outcomes.solved(folder, project.model_copy(update={"drift": chosen}))
+        assert found.inputs.project.drift == chosen
+        expected = filtered(found.solution.targets["roof"].history, chosen).p1_m
+        np.testing.assert_array_equal(found.solution.histories["roof"].p1_m, expected)
+        assert np.array_equal(expected, motion, equal_nan=True) == (chosen == project.drift)
 
 
 def test_results_are_fresh_while_the_content_of_every_input_is_that_of_the_run(tracked: TestClient) -> None:

@@ -17,6 +17,7 @@ ORDER = (
     "version",
     "errors",
     "progress",
+    "parallel",
     "coordinates",
     "robust",
     "storage",
