@@ -17,7 +17,7 @@ def browser():
 
 
 @pytest.fixture(scope="session")
-def measured(tmp_path_factory):
+def headless(tmp_path_factory):
     """The folder of the sample with the headless engine's results, which no test changes."""
     return measured_sample(shared_folder(tmp_path_factory) / "measured-sample")
 

@@ -24,10 +24,10 @@ FAR_PX = 40
 
 
 @pytest.fixture(scope="module")
-def pages(measured, tmp_path_factory):
+def pages(headless, tmp_path_factory):
     """The address of the pages of the shipped sample, measured; no test changes it."""
     workspace = tmp_path_factory.mktemp("workspace")
-    shutil.copytree(measured, workspace / "sample")
+    shutil.copytree(headless, workspace / "sample")
     with serving(workspace, free_port()) as address:
         yield f"{address}/p/sample"
 

@@ -25,24 +25,24 @@ SAME_M = 1e-5  # the contract's: what stopping and going on may change
 
 
 @pytest.fixture(scope="module")
-def finished(measured, server):
+def finished(headless, server):
     """The address of a project's pages that no test changes."""
     workspace, address = server
-    shutil.copytree(measured, workspace / "finished")
+    shutil.copytree(headless, workspace / "finished")
     return f"{address}/p/finished"
 
 
 @pytest.fixture
-def project(measured, server, request):
+def project(headless, server, request):
     """A project of its own for a test that changes it: its folder and its pages' address."""
     workspace, address = server
     name = folder_name(request)
-    shutil.copytree(measured, workspace / name)
+    shutil.copytree(headless, workspace / name)
     return workspace / name, f"{address}/p/{name}"
 
 
-def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engine(browser, measured, tmp_path):
-    shutil.copytree(measured, tmp_path / "sample", ignore=shutil.ignore_patterns("results"))
+def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engine(browser, headless, tmp_path):
+    shutil.copytree(headless, tmp_path / "sample", ignore=shutil.ignore_patterns("results"))
     port = free_port()
     with serving(tmp_path, port) as address, watched(browser, address) as page:
         page.goto(f"{address}/p/sample/track")
@@ -68,13 +68,13 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
     run_project(tmp_path / "sample")
     assert downloaded == (tmp_path / "sample" / "results" / "roof.csv").read_bytes()
     again = tmp_path / "sample"
-    resumed, straight = (read_history_csv(folder / "results" / "roof.csv") for folder in (again, measured))
+    resumed, straight = (read_history_csv(folder / "results" / "roof.csv") for folder in (again, headless))
     assert resumed.status.tolist() == straight.status.tolist()
     assert np.nanmax(np.abs(resumed.p1_m - straight.p1_m)) < SAME_M  # a lost frame has no value in either
 
 
-def test_a_server_that_is_gone_is_noticed_and_found_again(browser, measured, tmp_path):
-    shutil.copytree(measured, tmp_path / "sample", ignore=shutil.ignore_patterns("results"))
+def test_a_server_that_is_gone_is_noticed_and_found_again(browser, headless, tmp_path):
+    shutil.copytree(headless, tmp_path / "sample", ignore=shutil.ignore_patterns("results"))
     port = free_port()
     with watched(browser, f"http://127.0.0.1:{port}") as page:
         bar = page.get_by_text("The server does not answer")
@@ -393,8 +393,8 @@ def test_the_interval_of_rest_is_dragged_on_the_plot(browser, project):
         eventually(lambda: read_project(folder).intervals_s.pre_event[1] == pytest.approx(end - 1, abs=0.002))
 
 
-def test_table_2_says_what_the_summary_says(browser, measured, finished):
-    gps = json.loads((measured / "results" / "summary.json").read_text())["targets"]["roof"]["gps"]
+def test_table_2_says_what_the_summary_says(browser, headless, finished):
+    gps = json.loads((headless / "results" / "summary.json").read_text())["targets"]["roof"]["gps"]
     with watched(browser, finished) as page:
         page.goto(f"{finished}/export")
         row = page.locator(".comparison tbody tr").first

@@ -33,7 +33,7 @@ CLICK_PX = 0.25
 PIXEL_CM = 2.0
 
 
-def test_from_four_files_to_the_csv_that_the_headless_engine_writes(browser, server, measured):
+def test_from_four_files_to_the_csv_that_the_headless_engine_writes(browser, server, headless):
     workspace, address = server
     folder, pages = workspace / "first-try", f"{address}/p/first-try"
     decided = read_project(SAMPLE)
@@ -47,13 +47,13 @@ def test_from_four_files_to_the_csv_that_the_headless_engine_writes(browser, ser
         look_through(page, pages)
         tell_intervals(page, pages, decided)
         sweep_corners(page, pages)
-        downloaded = download(page, pages, folder, measured)
+        downloaded = download(page, pages, folder, headless)
     made = read_project(folder)
     aimed = np.array([pair.frame_px for pair in decided.correspondences])
     missed = np.array([pair.frame_px for pair in made.correspondences]) - aimed
     assert len(missed) == 20
     assert 0.5 * CLICK_PX < missed.std() < 1.5 * CLICK_PX
-    agree(downloaded, measured / "results" / "roof.csv", decided)
+    agree(downloaded, headless / "results" / "roof.csv", decided)
 
 
 def tell_antenna(page: Page, decided: Project) -> None:
