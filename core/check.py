@@ -122,6 +122,8 @@ def _scale_obstacle(project: Project, target: Target, reference: ReferenceFit | 
 
 def _time_obstacles(project: Project, index: FrameIndex) -> Iterator[str]:
     frames, times_s = len(index), index.time_s
+    if all(project.is_excluded(number) for number in range(frames)):
+        yield "excluded_frames: leave no frame of the video; take some of them out"
     if project.reference_frame >= frames:
         yield f"reference_frame: is {project.reference_frame}, but the video ends with frame {frames - 1}; lower it"
     for name, interval in project.intervals_s:
@@ -144,8 +146,8 @@ def _time_obstacles(project: Project, index: FrameIndex) -> Iterator[str]:
 def _problems_of_file(file: Path) -> list[str]:
     """Return the problems of a `project.json` one by one; none where it cannot be parsed at all."""
     try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        document = json.loads(file.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError):
         return []
     return [f"{file}: {problem}." for problem in project_problems(document)]
 
