@@ -172,11 +172,18 @@ def _read_inputs(
         tried(_require_lens_of_video, lens, folder / given.lens, info, video)
     cloud = tried(read_cloud, folder / given.cloud, progress) if given.cloud and with_cloud else None
     if cloud:
-        tried(fit_ground_plane, cloud, project.orthoimage.ground_z_m)
+        tried(_require_ground, cloud, project, folder)
     if given.gps:
         tried(read_gps, folder / given.gps.file, given.gps)
     reference = tried(_fit_reference, project, lens, info) if info and bool(lens) == bool(given.lens) else None
     return _Inputs(info=info, index=index, lens=lens, cloud=cloud, reference=reference)
+
+
+def _require_ground(cloud: Cloud, project: Project, folder: Path) -> None:
+    try:
+        fit_ground_plane(cloud, project.orthoimage.ground_z_m)
+    except InputError as error:
+        raise InputError(f"{folder / str(project.inputs.cloud)}: {error}") from None
 
 
 def _require_lens_of_video(lens: Lens, lens_file: Path, info: VideoInfo, video: File) -> None:

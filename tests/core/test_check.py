@@ -124,6 +124,14 @@ def test_what_overwhelms_the_parser_is_no_project(tmp_path: Path, text: str) -> 
     assert "no project looks like this" in line
 
 
+def test_a_cloud_without_ground_is_named(inputs: Path) -> None:
+    (inputs / "few.csv").write_text("x,y,z\n-9,-9,0\n9,9,0\n0,0,3\n", encoding="utf-8")
+    assert any(
+        line.startswith(f"{inputs / 'few.csv'}: ") and "without ground" in line
+        for line in problems(inputs, put("few.csv", "inputs", "cloud"))
+    )
+
+
 def test_lens_of_another_image_size(inputs: Path) -> None:
     write_lens(inputs / "other.yaml", Lens.ideal((320, 240), 300.0))
     (line,) = problems(inputs, put("other.yaml", "inputs", "lens"))
