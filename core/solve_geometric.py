@@ -208,11 +208,11 @@ def _solve_target(
     places, rotation = moved - start_m, fit.rotation_rad - start_rad
     part = height / used.pose0.centre_m[2]
     pixel_m = (used.pose0.centre_m[2] - height) / float(used.lens.focal_px.mean())
-    frames = len(recording.frame)
+    centre_sigma_m = _sigma_of_centres(ground) if flight is None else flight.sigma_m
     common_m = common_error(fit.residual, recording.time_s, at_rest)
     sigma = combined_sigma(
         _sigma_of_points(fit, body),
-        camera_m=np.zeros((frames, 2)) if flight is None else part * flight.sigma_m[:, :2],
+        camera_m=part * centre_sigma_m[:, :2],
         shared_m=np.hypot(GROUND_PART * ground.rms_px * pixel_m, common_m),
         slow_m=slow_m,
         places_m=places,
@@ -243,6 +243,15 @@ def _paper_scale(target: Target, flat: RestBody, pose0: Pose, height_m: float) -
     if target.p1_p2_m is not None and target.kind == "lines":
         return target.p1_p2_m / float(np.linalg.norm(flat.places[0] - flat.places[1]))
     return float((pose0.centre_m[2] - height_m) / pose0.centre_m[2])
+
+
+def _sigma_of_centres(ground: Ground) -> Floats:
+    """Return what the scatter of the ground makes of single camera centres (F, 3), metres, where they are usable."""
+    poses = ground.known_poses
+    covariance = np.linalg.pinv(np.where(ground.usable[:, None, None], poses.normal, np.eye(6)), hermitian=True)
+    squared = np.nansum(poses.weight[..., None] * poses.residual**2, axis=(1, 2))
+    unit_sigma = np.sqrt(squared / np.maximum(2 * np.count_nonzero(poses.weight, axis=1) - 6, 1))
+    return np.asarray(unit_sigma[:, None] * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)[:, 3:]))
 
 
 def _sigma_of_points(fit: RigidFit, body: RestBody) -> Sigma:
