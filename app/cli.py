@@ -166,6 +166,8 @@ def _lens(options: argparse.Namespace) -> int:
     from core.lens import write_lens
     from core.lens_calibration import calibrate
 
+    if options.out.is_dir():
+        raise InputError(f"{options.out}: is a folder; name the lens file to write in it.")
     progress = TerminalProgress(sys.stdout)
     with _stoppable(progress) as cancel:
         calibration = calibrate(

@@ -105,6 +105,8 @@ def obstacles(project: Project, index: FrameIndex | None, reference: ReferenceFi
 
 def _time_obstacles(project: Project, index: FrameIndex) -> Iterator[str]:
     frames, times_s = len(index), index.time_s
+    if all(project.is_excluded(number) for number in range(frames)):
+        yield "excluded_frames: leave no frame of the video; take some of them out"
     if project.reference_frame >= frames:
         yield f"reference_frame: is {project.reference_frame}, but the video ends with frame {frames - 1}; lower it"
     for name, interval in project.intervals_s:
@@ -122,8 +124,8 @@ def _time_obstacles(project: Project, index: FrameIndex) -> Iterator[str]:
 def _problems_of_file(file: Path) -> list[str]:
     """Return the problems of a `project.json` one by one; none where it cannot be parsed at all."""
     try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        document = json.loads(file.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError):
         return []
     return [f"{file}: {problem}." for problem in project_problems(document)]
 
@@ -148,11 +150,18 @@ def _read_inputs(
         tried(_require_lens_of_video, lens, folder / given.lens, info, video)
     cloud = tried(read_cloud, folder / given.cloud, progress) if given.cloud and with_cloud else None
     if cloud:
-        tried(fit_ground_plane, cloud, project.orthoimage.ground_z_m)
+        tried(_require_ground, cloud, project, folder)
     if given.gps:
         tried(read_gps, folder / given.gps.file, given.gps)
     reference = tried(_fit_reference, project, lens, info) if info and bool(lens) == bool(given.lens) else None
     return _Inputs(info=info, index=index, lens=lens, cloud=cloud, reference=reference)
+
+
+def _require_ground(cloud: Cloud, project: Project, folder: Path) -> None:
+    try:
+        fit_ground_plane(cloud, project.orthoimage.ground_z_m)
+    except InputError as error:
+        raise InputError(f"{folder / str(project.inputs.cloud)}: {error}") from None
 
 
 def _require_lens_of_video(lens: Lens, lens_file: Path, info: VideoInfo, video: File) -> None:

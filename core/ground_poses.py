@@ -27,6 +27,8 @@ STANDING_FRAMES = 150
 STANDING_ROUNDS = 4
 # Frames, evenly spread, that say how steady a feature is.
 TRUST_FRAMES = 1000
+# In fewer frames than these, a feature agrees with the others, or stands out of them, by chance.
+LEAST_TRUST_FRAMES = 10
 # Least scatter of ground points at which outliers are told, pixels.
 LEAST_SIGMA_PX = 0.01
 # An encoder short of bits repeats the ground of a key frame in the frames that follow, while strips go on moving. It is
@@ -93,9 +95,11 @@ def solve_ground(
     focal = float(lens.focal_px.mean())
     least = LEAST_SIGMA_PX / focal
     poses = fit_poses(rays, weight, points, pose0, sigma_floor=least)
-    trusted = weight * _trust(poses)
-    trusted *= ~_standing(rays, trusted, points, poses, pose0=pose0, least_sigma=least)
-    poses = fit_poses(rays, trusted, points, poses, iterations=4, sigma_floor=least)
+    trusted = weight
+    if len(rays) >= LEAST_TRUST_FRAMES:
+        trusted = weight * _trust(poses)
+        trusted *= ~_standing(rays, trusted, points, poses, pose0=pose0, least_sigma=least)
+        poses = fit_poses(rays, trusted, points, poses, iterations=4, sigma_floor=least)
     agreeing = np.where(trusted > 0, poses.weight / np.maximum(trusted, 1e-300), 0.0)
     inlier = agreeing > 0.1
     squared = np.where(inlier, (np.nan_to_num(poses.residual) ** 2).sum(axis=-1), 0.0)

@@ -28,6 +28,8 @@ MIN_VIEWS = 4
 # Frames of a video are looked at this many times at most, in equal parts of its duration.
 _VIDEO_PARTS = 40
 _FRAMES_PER_PART = 5
+# Boards whose corners lie no farther apart than this show nothing twice but its noise, which counts as knowledge then.
+_REPEATED_PX = 0.5
 # A board is looked for in a picture of about this width first: fast, and blind to fine texture.
 _SEARCH_WIDTH_PX = 1600
 # A view whose edges rise over so many times more pixels than those of the others was out of focus or moved;
@@ -189,7 +191,7 @@ def calibrate_images(images: Iterable[tuple[str, Luma]], board: tuple[int, int],
         views.append(_view(name, image, board))
     if size is None:
         raise InputError("no pictures of a checkerboard were given; give 10 to 30, tilted, to the edges of the image.")
-    views, fit = _fitted(_without_blurred(views, board), (size[1], size[0]), board, square_m)
+    views, fit = _fitted(_without_repeated(_without_blurred(views, board)), (size[1], size[0]), board, square_m)
     return _judged(views, fit, (size[1], size[0]), board, square_m)
 
 
@@ -265,6 +267,21 @@ def _without_blurred(views: list[View], board: tuple[int, int]) -> list[View]:
                 view = replace(view, left_out=f"blurred, edges rise over {view.edge_px:.1f} px, {limit:.1f} at most")
         judged.append(view)
     return judged
+
+
+def _without_repeated(views: list[View]) -> list[View]:
+    """Leave out what shows the board where another view has it already: a copy of a file, or a board at rest."""
+    judged = list[View]()
+    for view in views:
+        first = next((known for known in judged if not known.left_out and _show_the_same(known, view)), None)
+        judged.append(view if first is None or view.left_out else replace(view, left_out=f"the same as {first.name}"))
+    return judged
+
+
+def _show_the_same(one: View, other: View) -> bool:
+    if one.corners_px is None or other.corners_px is None:
+        return False
+    return float(np.abs(one.corners_px - other.corners_px).max()) < _REPEATED_PX
 
 
 def _shortest_square_px(corners: Floats, board: tuple[int, int]) -> float:

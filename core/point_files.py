@@ -227,6 +227,11 @@ def _text_layout(path: Path) -> _TextLayout:
                 names = [_COLUMN_OF_NAME.get(word.lower().lstrip("#/"), word.lower()) for word in words if word != "#"]
             elif len(words) == 1 and words[0].isdigit():
                 count = int(words[0])
+            elif _has_decimal_commas(line):
+                raise InputError(
+                    f"{path}: line {number + 1} has decimal commas, which cannot be told from commas between columns; "
+                    "export the points with decimal points."
+                )
             elif len(words) >= 3 and _all_numbers(words):
                 return _TextLayout(number, names or _names_by_number(path, stream, words), count)
             else:
@@ -239,6 +244,12 @@ def _text_layout(path: Path) -> _TextLayout:
 
 def _words(line: bytes) -> list[str]:
     return [word.strip('"') for word in re.split(r"[\s,;]+", _spaced(line)) if word]
+
+
+def _has_decimal_commas(line: bytes) -> bool:
+    """Whether a line such as `12,34;5,60;0,01` has other things than commas between its columns."""
+    words = re.split(rb"[\s;]+", line.strip())
+    return len(words) >= 3 and b"." not in line and any(re.fullmatch(rb"[-+]?\d+,\d+", word) for word in words)
 
 
 def _as_names(words: list[str]) -> bool:

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from core.errors import InputError
 from core.storage import write_atomically
@@ -32,6 +32,15 @@ Method = Literal["geometric", "paper"]
 LINE_NAMES = ("L1", "L2", "T1")
 
 
+def _named(file: str) -> str:
+    if not file or "\0" in file:
+        raise ValueError("names no file; give its path, or null where there is none")
+    return file
+
+
+FileName = Annotated[str, AfterValidator(_named)]
+
+
 class Model(BaseModel):
     """Frozen, and refuses keys it does not know."""
 
@@ -41,7 +50,7 @@ class Model(BaseModel):
 class GpsInput(Model):
     """A GPS record and the names of its columns."""
 
-    file: str
+    file: FileName
     time: str = "time_s"
     x: str = "east_m"
     y: str = "north_m"
@@ -51,9 +60,9 @@ class GpsInput(Model):
 class Inputs(Model):
     """Files measured from; paths are relative to the project folder."""
 
-    video: str
-    cloud: str | None = None
-    lens: str | None = None
+    video: FileName
+    cloud: FileName | None = None
+    lens: FileName | None = None
     gps: GpsInput | None = None
 
 
@@ -235,10 +244,14 @@ def parse_project(text: str, file: Path | str = PROJECT_FILE) -> Project:
         InputError: with every problem and its path in the file.
     """
     try:
-        document = json.loads(text, object_pairs_hook=lambda pairs: _without_repetition(pairs, file))
+        # Windows' Notepad may put a byte order mark before the text.
+        content = text.removeprefix("\ufeff")
+        document = json.loads(content, object_pairs_hook=lambda pairs: _without_repetition(pairs, file))
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
         raise InputError(f"{file}: {place} is not valid JSON ({error.msg}); correct it there.") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{file}: no project looks like this ({error}); restore it from a copy.") from None
     problems = project_problems(document)
     if problems:
         raise InputError(f"{file}: " + "; ".join(problems) + ".")

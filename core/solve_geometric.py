@@ -193,7 +193,7 @@ def _solve_target(
     places, rotation = moved - start_m, fit.rotation_rad - start_rad
     sigma = combined_sigma(
         _sigma_of_points(fit, body),
-        camera_m=_camera_part(target, used, flight, frames=len(recording.frame)),
+        camera_m=_camera_part(target, used, ground, flight),
         shared_m=np.hypot(_ground_part(target, used, ground), common_error(fit.residual, recording.time_s, at_rest)),
         slow_m=slow_m,
         places_m=places,
@@ -238,17 +238,25 @@ def _without_parallax_correction(
     return scale * np.stack([fit.at(place, flat.centre) for place in flat.places], axis=1), fit.rotation_rad
 
 
-def _camera_part(target: Target, used: Calibration, flight: SmoothFlight | None, *, frames: int) -> Floats:
+def _camera_part(target: Target, used: Calibration, ground: Ground, flight: SmoothFlight | None) -> Floats:
     """Return what the noise left in the camera's path moves a target by, (F, 2) metres."""
-    if flight is None:
-        return np.zeros((frames, 2))
-    return np.asarray(used.heights_m[target.name] / used.pose0.centre_m[2] * flight.sigma_m[:, :2])
+    centre_sigma_m = _sigma_of_centres(ground) if flight is None else flight.sigma_m
+    return np.asarray(used.heights_m[target.name] / used.pose0.centre_m[2] * centre_sigma_m[:, :2])
 
 
 def _ground_part(target: Target, used: Calibration, ground: Ground) -> Floats:
     """Return what the ground errs by as a whole, (F,) metres at a target's height."""
     pixel_m = (used.pose0.centre_m[2] - used.heights_m[target.name]) / float(used.lens.focal_px.mean())
     return np.asarray(GROUND_PART * ground.rms_px * pixel_m)
+
+
+def _sigma_of_centres(ground: Ground) -> Floats:
+    """Return what the scatter of the ground makes of single camera centres (F, 3), metres, where they are usable."""
+    poses = ground.known_poses
+    covariance = np.linalg.pinv(np.where(ground.usable[:, None, None], poses.normal, np.eye(6)), hermitian=True)
+    squared = np.nansum(poses.weight[..., None] * poses.residual**2, axis=(1, 2))
+    unit_sigma = np.sqrt(squared / np.maximum(2 * np.count_nonzero(poses.weight, axis=1) - 6, 1))
+    return np.asarray(unit_sigma[:, None] * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)[:, 3:]))
 
 
 def _sigma_of_points(fit: RigidFit, body: RestBody) -> Sigma:

@@ -26,12 +26,22 @@ from core.project import GpsInput, Intervals
 
 # Velocities of the same motion correlate above 0.9; of two records of noise, below 0.3 at every lag tried.
 _LEAST_CORRELATION = 0.5
+# Through fewer samples than these, some stretch of the video fits by chance.
+_LEAST_SHARED = 12
+# Every lag that correlates with this part of the best is refined, up to so many: a slow receiver sees few samples of
+# the shaking, and then a wrong lag may correlate better than the right one, though it fits worse.
+_CANDIDATE = 0.6
+_MOST_CANDIDATES = 12
 # Of lags a period apart under heavy drift, the wrong one was taken only where it fitted within this of the right one.
 _RIVAL = 1.2
 # A GPS time is compared where the video was measured on both sides, not farther apart than this many frames.
 _BRIDGED_FRAMES = 3.5
 # Samples a record may lack: about six days at 10 Hz. Laid out evenly they take a gigabyte when they are correlated.
 _MOST_MISSING = 5_000_000
+# Lags tried between two GPS samples, unless frames lie farther apart.
+_TRIALS_PER_SAMPLE = 5
+# The time in which a change stands well out of the noise of two samples, and the shaking does not yet turn round.
+_LEAST_CHANGE_S = 0.1
 # GPS samples farther apart than this many frames straddle peaks that the video sees.
 _COARSE_FRAMES = 1.5
 
@@ -390,7 +400,8 @@ class _Lag:
         if self.sigma_s is None:
             return (
                 f"The clock lag of {name} could not be told, because video and GPS show no motion in common "
-                f"(correlation {self.correlation:.2f}); the records are compared as if their clocks agreed."
+                f"over {_LEAST_SHARED} samples or more (correlation {self.correlation:.2f}); the records are compared "
+                "as if their clocks agreed."
             )
         if self.rival_s is not None:
             return (
@@ -409,8 +420,8 @@ def _lag(video: _Video, gps: GpsRecord, max_lag_s: float | None) -> _Lag:
     if best < _LEAST_CORRELATION:
         return _Lag(0.0, None, best)
     # Regular shaking correlates nearly as well a period earlier or later: every good peak is refined, the best kept.
-    higher = (correlations >= 0.9 * best) & _local_maxima(correlations)
-    coarse = np.flatnonzero(higher)[np.argsort(correlations[higher])[::-1][:5]]
+    higher = (correlations >= _CANDIDATE * best) & _local_maxima(correlations)
+    coarse = np.flatnonzero(higher)[np.argsort(correlations[higher])[::-1][:_MOST_CANDIDATES]]
     step_s = float(lags_s[1] - lags_s[0]) if len(lags_s) > 1 else 0.1
     refined = [
         min(
@@ -428,29 +439,47 @@ def _lag(video: _Video, gps: GpsRecord, max_lag_s: float | None) -> _Lag:
 
 
 def _correlations(video: _Video, gps: GpsRecord) -> tuple[Floats, Floats]:
-    """Return (L,) lags and the correlation of the velocities at each, over all lags at which the records touch.
+    """Return (L,) lags and, at each, the correlation of the changes from one GPS sample on.
 
-    Each is measured against all of the video's motion, so that a short stretch that happens to fit does not win.
+    The video's change over the same time is looked up at every lag, so that a receiver slower than the motion takes
+    none of it for another. All lags are tried at which the records touch, and each is measured against all of the
+    video's motion, so that a short stretch that happens to fit does not win.
     """
-    step_s = max(float(np.median(np.diff(video.times))), float(np.median(np.diff(gps.time_s))) / 2)
-    video_velocity = _velocity(video.times, video.moved, step_s)
-    gps_velocity = _velocity(gps.time_s, gps.position_m, step_s)
-    product_x, product_y = (correlate(video_velocity[:, axis], gps_velocity[:, axis], method="fft") for axis in (0, 1))
-    product = product_x + product_y
-    energy = correlate(np.ones(len(video_velocity)), np.sum(gps_velocity**2, axis=1), method="fft")
+    apart_s = float(np.median(np.diff(gps.time_s)))
+    step_s = max(float(np.median(np.diff(video.times))), apart_s / _TRIALS_PER_SAMPLE)
+    change_s = max(apart_s, step_s, _LEAST_CHANGE_S)
+    grid_s = np.arange(video.times[0], video.times[-1] + step_s / 2, step_s)
+    video_change = _moved_in(video.times, video.moved, grid_s, change_s)
+    place, first = np.unique(np.rint((gps.time_s - gps.time_s[0]) / step_s).astype(np.int64), return_index=True)
+    sampled = np.zeros((int(place[-1]) + 1, 1))
+    sampled[place] = 1.0
+    gps_change = np.zeros((len(sampled), 2))
+    gps_change[place] = _moved_in(gps.time_s, gps.position_m, gps.time_s[first], change_s)
+    everywhere = np.ones((len(grid_s), 1))
+    video_energy = _summed(video_change**2 @ [[1.0], [1.0]], sampled)
+    video_energy = np.maximum(video_energy, np.sum(video_change**2) * step_s / max(apart_s, step_s))
+    gps_energy = _summed(everywhere, gps_change**2 @ [[1.0], [1.0]])
     # What a quiet stretch of GPS would divide by is noise; a hundredth of the mean energy keeps it from counting.
-    energy = np.maximum(energy, 0.01 * np.sum(gps_velocity**2) * len(video_velocity) / len(gps_velocity))
-    scale = np.sqrt(np.sum(video_velocity**2) * energy)
-    shifts = np.arange(len(product)) - (len(gps_velocity) - 1)
-    correlations = np.divide(product, scale, out=np.zeros_like(scale), where=scale > 0)
+    gps_energy = np.maximum(gps_energy, 0.01 * np.sum(gps_change**2) * len(grid_s) / len(sampled))
+    scale = np.sqrt(video_energy * gps_energy)
+    enough = (scale > 0) & (_summed(everywhere, sampled) > _LEAST_SHARED - 0.5)
+    correlations = np.divide(_summed(video_change, gps_change), scale, out=np.zeros_like(scale), where=enough)
+    shifts = np.arange(len(scale)) - (len(sampled) - 1)
     return shifts * step_s + video.times[0] - gps.time_s[0], correlations
 
 
-def _velocity(times: Floats, positions: Floats, step_s: float) -> Floats:
-    """Return (M, 2) on an even grid from the first time on."""
-    grid_s = np.arange(times[0], times[-1] + step_s / 2, step_s)
-    even = np.stack([np.interp(grid_s, times, positions[:, axis]) for axis in (0, 1)], axis=1)
-    return np.asarray(np.gradient(even, step_s, axis=0), dtype=np.float64)
+def _summed(video: Floats, gps: Floats) -> Floats:
+    """Return (L,) the sum of products of columns (M, K) and (G, K) at every shift of the second against the first."""
+    columns = [correlate(*pair, method="fft") for pair in zip(video.T, gps.T, strict=True)]
+    return np.asarray(np.sum(columns, axis=0), dtype=np.float64)
+
+
+def _moved_in(times: Floats, positions: Floats, from_s: Floats, duration_s: float) -> Floats:
+    """Return (M, 2) by how much the position changes in a time from each of M instants on; 0 beyond the record."""
+    columns = [
+        np.interp(from_s + duration_s, times, column) - np.interp(from_s, times, column) for column in positions.T
+    ]
+    return np.stack(columns, axis=1)
 
 
 def _local_maxima(values: Floats) -> Bools:

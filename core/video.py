@@ -24,6 +24,7 @@ from typing import BinaryIO
 import av
 import numpy as np
 from av.container import InputContainer
+from av.stream import Disposition
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
@@ -115,7 +116,7 @@ class FrameIndex:
 
 @contextmanager
 def opened_video(path: File) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Open a video and its first stream of pictures.
+    """Open a video and its stream of pictures: of several, as with a thumbnail, the one with the largest frames.
 
     Raises:
         InputError: as `probe`, but for what only decoding tells.
@@ -126,7 +127,12 @@ def opened_video(path: File) -> Iterator[tuple[InputContainer, VideoStream]]:
         container = stack.enter_context(_container(path, source))
         if not container.streams.video:
             raise InputError(f"{path}: holds no video stream; choose the file with the pictures.")
-        yield container, container.streams.video[0]
+        yield container, max(container.streams.video, key=_is_film_and_size)
+
+
+def _is_film_and_size(stream: VideoStream) -> tuple[bool, int]:
+    """Order streams of pictures: a cover picture, however large, comes before any film."""
+    return not stream.disposition & Disposition.attached_pic, stream.width * stream.height
 
 
 def _container(path: File, source: str | BinaryIO) -> InputContainer:

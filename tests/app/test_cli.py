@@ -191,6 +191,11 @@ def test_a_mistake_in_the_command_gets_one_sentence(
     one_sentence(capsys.readouterr().err)
 
 
+def test_a_lens_is_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["lens", "a.jpg", "--board", "9x6", "--square-m", "0.025", "--out", str(tmp_path)]) == 1
+    assert f"{tmp_path}: is a folder" in one_sentence(capsys.readouterr().err)
+
+
 # check
 
 

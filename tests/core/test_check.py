@@ -61,6 +61,9 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
         (put(None, "inputs", "lens"), 'inputs.lens: missing, but method "geometric" needs it'),
         (put("gone.laz", "inputs", "cloud"), "gone.laz: not found"),
         (put(90, "reference_frame"), "reference_frame: is 90, but the video ends with frame 39"),
+        (put("", "inputs", "cloud"), "inputs.cloud: names no file; give its path, or null"),
+        (put("a\0b.csv", "inputs", "gps", "file"), "inputs.gps.file: names no file"),
+        (put([[0, 20], [15, 39]], "excluded_frames"), "excluded_frames: leave no frame of the video"),
         (put([[30, 45]], "excluded_frames"), "excluded_frames[0]: [30, 45] ends after the last frame, 39"),
         (put([], "correspondences"), "no correspondence is enabled, at least four are needed"),
         (
@@ -124,6 +127,28 @@ def test_all_problems_are_told_at_once(inputs: Path) -> None:
         document["inputs"]["lens"] = "gone.yaml"
 
     assert len(problems(inputs, change)) == 3
+
+
+def test_a_byte_order_mark_is_no_mistake(inputs: Path) -> None:
+    small_project.write_document(inputs, small_project.document())
+    file = inputs / "project.json"
+    file.write_text(file.read_text(encoding="utf-8"), encoding="utf-8-sig")
+    assert check_project(inputs) == []
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"rooftrack": ' + "9" * 5000 + "}"])
+def test_what_overwhelms_the_parser_is_no_project(tmp_path: Path, text: str) -> None:
+    (tmp_path / "project.json").write_text(text, encoding="utf-8")
+    (line,) = check_project(tmp_path)
+    assert "no project looks like this" in line
+
+
+def test_a_cloud_without_ground_is_named(inputs: Path) -> None:
+    (inputs / "few.csv").write_text("x,y,z\n-9,-9,0\n9,9,0\n0,0,3\n", encoding="utf-8")
+    assert any(
+        line.startswith(f"{inputs / 'few.csv'}: ") and "without ground" in line
+        for line in problems(inputs, put("few.csv", "inputs", "cloud"))
+    )
 
 
 def test_lens_of_another_image_size(inputs: Path) -> None:

@@ -218,6 +218,8 @@ REFUSED = [
     ("word.xyz", with_word, "line 42 does not hold 3 numbers"),
     ("two.csv", lambda file: file.write_text("1,2\n3,4\n"), "line 1 is neither names of columns"),
     ("five.csv", lambda file: file.write_text("1,2,3,4,5\n"), "has 5 columns without names"),
+    ("comma.xyz", lambda file: file.write_text("12,345;6,789;0,012\n"), "line 1 has decimal commas"),
+    ("commas.txt", lambda file: file.write_text("x y z\n12,345 6,789 0\n"), "line 2 has decimal commas"),
     ("noz.ply", lambda file: file.write_bytes(
         b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\nend_header\n"
         + struct.pack("<ff", 1, 2)), "has no column z"),

@@ -113,6 +113,13 @@ def test_bad_pictures_are_named_and_left_out():
     assert found.lens.focal_px == pytest.approx(calibration().lens.focal_px, rel=1e-3)
 
 
+def test_a_picture_given_twice_counts_once():
+    copies = [(f"copy of {name}", image) for name, image in photographs()[:3]]
+    found = calibrate_images([*photographs(), *copies], BOARD, SQUARE_M)
+    assert [view.left_out for view in found.views[-3:]] == [f"the same as {name}" for name, _ in photographs()[:3]]
+    np.testing.assert_allclose(found.deviations, calibration().deviations, rtol=1e-4)
+
+
 def test_few_frontal_views_are_warned_of():
     frontal = [
         (f"f{i}", photograph((0.02 * i, 0.03 * (i % 3), 0.4 + 0.02 * i, (320 + 20 * i, 240)), seed=i)) for i in range(4)

@@ -428,6 +428,17 @@ def test_error_bars_grow_where_the_roof_is_seen_worse() -> None:
     assert during > 2.0 * before
 
 
+@pytest.mark.parametrize("frames", [6, 20])
+def test_error_bars_of_a_few_frames_hold_what_single_poses_err_by(frames: int) -> None:
+    """Too few to smooth the flight: the camera's noise stays in each frame, and no rest says how large it is."""
+    recording = scene.recording(0.01, frames)
+    ground = recording.ground_raw.copy()
+    ground[1:] += np.random.default_rng(4).normal(scale=0.3, size=ground[1:].shape)
+    history = solved(replace(recording, ground_raw=ground), intervals_s={}).histories["roof"]
+    ratio = ((history.p1_m - scene.truth(frames).p1_m) / history.p1_sigma_m)[1:]
+    assert 0.5 < np.sqrt((ratio**2).mean()) < 1.6
+
+
 def test_a_line_of_which_hardly_anything_is_seen_leaves_its_frame_lost() -> None:
     recording = scene.recording(NOISE_PX)
     roof = recording.targets_raw["roof"].copy()

@@ -47,6 +47,33 @@ def test_lag_is_found_to_a_fraction_of_a_sample(lag_s: float) -> None:
     np.testing.assert_allclose(comparison.rms_m, NOISE_M, rtol=0.2)
 
 
+@pytest.mark.parametrize("first", range(0, 10, 2))
+def test_a_receiver_slower_than_the_motion_tells_the_lag_all_the_same(first: int) -> None:
+    time_s, moved = video()
+    often = gps_with_lag(-4.3)
+    once_a_second = GpsRecord("gps.csv", often.time_s[first::10], often.position_m[first::10])
+    comparison = compare_with_gps(time_s, moved, once_a_second, INTERVALS)
+    assert comparison.lag_sigma_s is not None
+    assert comparison.lag_s == pytest.approx(-4.3, abs=5 * comparison.lag_sigma_s)
+    assert abs(comparison.correlation) <= 1.0
+
+
+def test_too_few_samples_tell_no_lag() -> None:
+    time_s, moved = video()
+    often = gps_with_lag(0.0)
+    seldom = GpsRecord("gps.csv", often.time_s[::40], often.position_m[::40])
+    comparison = compare_with_gps(time_s, moved, seldom, INTERVALS)
+    assert comparison.lag_sigma_s is None
+    assert "clock lag of gps.csv could not be told" in comparison.message
+
+
+def test_times_in_milliseconds_share_nothing_with_the_video() -> None:
+    time_s, moved = video()
+    record = gps_with_lag(-5.0)
+    with pytest.raises(InputError, match="share nothing with the measured video"):
+        compare_with_gps(time_s, moved, GpsRecord("gps.csv", 1000 * record.time_s + 60e3, record.position_m), INTERVALS)
+
+
 def test_lag_survives_drift_offset_and_lost_frames() -> None:
     time_s, moved = video()
     moved = moved + 0.05 * np.sin(2 * np.pi * 0.06 * time_s)[:, None] + 0.3

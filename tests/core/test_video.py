@@ -8,6 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from av.stream import Disposition
 
 from core.errors import InputError
 from core.video import FramesAhead, Luma, frame_index, probe, read_frame, read_frames, read_frames_rgb
@@ -195,6 +196,38 @@ def test_no_video_at_all(tmp_path: Path) -> None:
     file.write_bytes(b"")
     with pytest.raises(InputError, match=r"text\.mp4"):
         probe(file)
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_of_several_streams_the_one_with_the_largest_frames_is_the_film(tmp_path: Path, suffix: str) -> None:
+    file = tmp_path / f"video.{suffix}"
+    with av.open(str(file), "w") as container:
+        streams = [(container.add_stream("libx264", rate=25), size) for size in ((48, 32), SIZE, (64, 48))]
+        for stream, (stream.width, stream.height) in streams:
+            stream.pix_fmt = "yuv420p"
+        for stream, size in streams:
+            for number in range(FRAMES if size == SIZE else 1):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(number, size), format="gray")))
+            container.mux(stream.encode())
+    assert (probe(file).width, probe(file).height) == SIZE
+    assert [number_of(frame.luma) for frame in read_frames(file)] == list(range(FRAMES))
+
+
+def test_a_cover_picture_is_no_film_however_large(tmp_path: Path) -> None:
+    file, large = tmp_path / "video.mp4", (SIZE[0] * 4, SIZE[1] * 4)
+    with av.open(str(file), "w") as container:
+        cover = container.add_stream("mjpeg", rate=1)
+        cover.disposition = Disposition.attached_pic
+        film = container.add_stream("libx264", rate=25)
+        cover.width, cover.height = large
+        film.width, film.height = SIZE
+        cover.pix_fmt, film.pix_fmt = "yuvj420p", "yuv420p"
+        container.mux(cover.encode(av.VideoFrame.from_ndarray(picture(0, large), format="gray")))
+        for number in range(5):
+            container.mux(film.encode(av.VideoFrame.from_ndarray(picture(number), format="gray")))
+        container.mux(film.encode())
+    assert (probe(file).width, probe(file).height) == SIZE
+    assert len(frame_index(file)) == 5
 
 
 def test_sound_alone(tmp_path: Path) -> None:
