@@ -489,6 +489,14 @@ def test_the_engines_sentences_are_told_in_words_of_the_pages(browser, project):
             "Correspondences: pair 3: [1, 2] is outside the 3 x 4 frame; click it again.",
             "correspondences",
         ),
+        "correspondence 5 lies where the lens model ends; move or disable it.": (
+            "Pair 5 lies where the lens model ends; move or disable it.",
+            "correspondences",
+        ),
+        "no correspondence is enabled, at least four are needed.": (
+            "No correspondence is enabled, at least four are needed.",
+            "correspondences",
+        ),
         "/w/p/gps.csv: is empty; export it again.": ("gps.csv: is empty; export it again.", None),
         "Measured 20 frames/s and 3 m/s.": ("Measured 20 frames/s and 3 m/s.", None),
         "/etc/x: lies outside the folders Rooftrack may read (/home/x).": (
@@ -586,6 +594,11 @@ def test_what_is_missing_is_named_with_the_way_to_it(browser, project, server):
         expect(page.get_by_text("Nothing was placed.")).to_be_attached()
         page.goto(f"{pages}/orthoimage")
         expect(page.get_by_role("button", name="Make the orthoimage")).to_be_disabled()
+        page.get_by_label("west", exact=True).fill("-5")
+        page.keyboard.press("Enter")
+        expect(page.locator("#raster .hint")).to_have_text(
+            "Give south, east and north too: until then, the extent stays as it was."
+        )
         made = page.request.post(
             f"{address}/api/projects", data={"name": "bare"}, headers={"X-Rooftrack": "1", "Origin": address}
         ).json()["id"]
@@ -714,6 +727,7 @@ def test_projects_are_copied_renamed_archived_restored_and_deleted_with_undo(bro
         card = page.locator(f"[data-project='{folder.name}']")
         act(page, card, "Rename…", name="Sample by hand")
         expect(card.get_by_role("heading")).to_have_text("Sample by hand")
+        expect(card.locator(".folder")).to_have_text(f"in folder {folder.name}")
         act(page, card, "Duplicate…", name="A copy of it")
         expect(page.get_by_role("heading", name="A copy of it")).to_be_visible()
         with page.expect_download() as download:

@@ -403,6 +403,11 @@ def test_the_interval_of_rest_is_dragged_on_the_plot(browser, project):
         handle.press("Shift+ArrowLeft")
         expect(handle).to_have_attribute("aria-valuenow", f"{end - 1:.2f}")
         eventually(lambda: read_project(folder).intervals_s.pre_event[1] == pytest.approx(end - 1, abs=0.002))
+        field = page.get_by_role("textbox", name="Residual to")
+        field.fill("500")
+        field.press("Enter")
+        expect(page.get_by_role("alert")).to_have_text(re.compile(r"The video ends at [\d.]+ s\."))
+        expect(field).to_have_attribute("aria-invalid", "true")
 
 
 def test_table_2_says_what_the_summary_says(browser, scene, finished):
