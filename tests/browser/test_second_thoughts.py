@@ -312,4 +312,7 @@ def test_a_look_at_what_is_not_there_yet_is_no_error(browser, project):
         expect(page.get_by_role("button", name="Start")).to_be_visible()
         page.goto(f"{pages}/export")
         expect(page.get_by_role("heading", name="Nothing measured yet")).to_be_visible()
-    assert refused == []
+        assert refused == []
+        page.goto(f"{address}/p/deleted-meanwhile")
+        expect(page.locator("#main")).to_contain_text("there is no such project")
+        expect(page.get_by_role("link", name="All projects")).to_be_visible()

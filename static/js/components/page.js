@@ -44,7 +44,7 @@ export async function openPage(step) {
     return { id, step, store, events, keys: bindKeys };
   } catch (error) {
     showDeadEnd(sentence(error));
-    throw error;
+    return new Promise(() => undefined); // the page goes no further
   }
 }
 
