@@ -415,7 +415,17 @@ def test_a_target_is_measured_relative_to_another(browser, project):
         page.get_by_role("button", name="Actions for table").click()
         page.get_by_role("menuitem", name="Delete").click()
         saved(page)
-    assert [(target.name, target.relative_to) for target in read_project(folder).targets] == [("roof", None)]
+        assert [(target.name, target.relative_to) for target in read_project(folder).targets] == [("roof", None)]
+        page.get_by_role("button", name="Add target").click()
+        page.get_by_role("menuitem", name="Three lines").click()
+        relative.select_option("roof")  # of a target still being drawn
+        act(page, page.locator("#targets li[data-target=roof]"), "Rename…", name="top")
+        page.locator("#targets li[data-target=table]").click()
+        expect(relative).to_have_value("top")
+        act(page, page.locator("#targets li[data-target=top]"), "Delete")
+        page.locator("#targets li[data-target=table]").click()
+        expect(relative).to_have_value("")
+        saved(page)
 
 
 def test_the_columns_of_another_gps_file_are_told(browser, project):

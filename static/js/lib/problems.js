@@ -38,6 +38,8 @@ const SAID_HERE = [
   [/correct inputs\.gps\.file of project\.json or set inputs\.gps to null/g, "choose the record again or remove it"],
   [/correct inputs\.video or put the file there/g, "choose the video again"],
   [/or set inputs\.gps to null/g, "or remove it"],
+  [/\bin pre_event\b/g, "in the pre-event interval"],
+  [/\banother pre_event\b/g, "another pre-event interval"],
   [/\bin ground_m\b/g, "on the ground"],
   [/\bin frame_px\b/g, "in the frame"],
   [/\borthoimage\.extent_m\b/g, "the orthoimage's extent"],
