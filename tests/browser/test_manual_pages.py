@@ -16,7 +16,7 @@ from playwright.sync_api import APIResponse, Page, Route, expect
 from core.lens import read_lens
 from core.project import read_project
 from tests.browser.hands import centre_of, fitted, zoomed
-from tests.browser.live import SAMPLE, ask, ask_bytes, eventually, watched
+from tests.browser.live import SAMPLE, arrived, ask, ask_bytes, eventually, watched
 from tests.browser.steps import (
     FRAME_SIZE,
     draw_bands,
@@ -241,15 +241,6 @@ def test_a_page_is_not_left_unasked_before_its_edits_are_saved(browser, project)
 def of_project(pages: str) -> str:
     """Return where a project is asked for and saved, given the address of its pages."""
     return pages.replace("/p/", "/api/projects/")
-
-
-def arrived(page: Page, held: list):
-    """Wait for what a page asks, and return it."""
-    for _ in range(500):
-        if held:
-            return held[0]
-        page.wait_for_timeout(20)
-    raise AssertionError("nothing came in time")
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from core.drift import high_pass
 from core.project import read_project
 from core.results import read_history_csv
 from core.run import run_project
-from tests.browser.live import ask, eventually, free_port, measured_sample, serving, shared_folder, watched
+from tests.browser.live import arrived, ask, eventually, free_port, measured_sample, serving, shared_folder, watched
 from tests.browser.steps import FRAME_SIZE
 
 FRAMES = 600
@@ -143,9 +143,9 @@ def test_an_answer_from_before_a_method_was_chosen_is_not_taken_for_the_new_one(
         page.route("**/results", hold_the_second)  # a page asks at once, and when its events begin
         page.goto(f"{pages}/track")
         expect(page.get_by_role("link", name="Review the result")).to_be_visible(timeout=30_000)
+        route, answer = arrived(page, held)
         page.get_by_role("radio", name="Paper").click()
         expect(page.locator(".note.info")).to_contain_text("Not measured by this method yet")
-        route, answer = held[0]
         route.fulfill(response=answer)
         page.wait_for_timeout(1000)
         expect(page.locator(".note.info")).to_contain_text("Not measured by this method yet")

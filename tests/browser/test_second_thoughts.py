@@ -64,15 +64,14 @@ def test_undo_takes_back_what_was_done_last(browser, project):
         expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(19)
         expect(half).to_have_count(1)
         saved(page)
+        assert [pair.id for pair in read_project(folder).correspondences] == [1, 2, *range(4, 21)]
         for _ in range(5):  # faster than it is answered, and more than there is
             page.keyboard.press("Control+z")
         expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(20)
         expect(page.get_by_role("button", name="Undo (Ctrl+Z)")).to_be_disabled()
         expect(page.locator(".toast")).to_have_count(0)
-        page.keyboard.press("Control+Shift+z")
-        expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(19)
         saved(page)
-    assert [pair.id for pair in read_project(folder).correspondences] == [1, 2, *range(4, 21)]
+    assert [pair.id for pair in read_project(folder).correspondences] == [*range(1, 21)]
 
 
 def test_a_band_is_drawn_again_over_the_old_one(browser, project):

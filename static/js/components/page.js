@@ -103,5 +103,7 @@ function showDeadEnd(message) {
     h("p", {}, message),
     h("a", { class: "button primary", href: "/" }, "All projects"),
   );
-  fill(find("#main"), h("div", { class: "page" }, box));
+  const main = find("#main");
+  main.className = "page";
+  fill(main, box);
 }

@@ -6,6 +6,7 @@ import { count, duration, fixed, millimetres, pixels, plural } from "../lib/form
 import { icon } from "../lib/icons.js";
 import { told } from "../lib/problems.js";
 import { setView, viewText } from "../lib/view-state.js";
+import { busyOver } from "../components/busy.js";
 import { stepUrl } from "../components/header.js";
 import { AXES, fetchHistory, fetchResults, methodName, METHODS } from "../components/histories.js";
 import { isRunning } from "../components/job-card.js";
@@ -102,7 +103,9 @@ page.events.on("online", show);
 page.events.on("job", onJob);
 page.events.on("track", addRows);
 page.events.on("results", () => void loadResults());
+const opened = busyOver(find(".stage-body"), "Reading the results…");
 await catchUp();
+opened();
 await loadDuration();
 
 /** Ask for the whole state: at first, and whenever the connection was lost. */
@@ -286,7 +289,7 @@ function earlierNote() {
   if (!isMeasured())
     return note("info", `Not measured by this method yet. The faint curve is the one of the ${of} method.`);
   if (!results?.stale) return null;
-  return note("warn", "The project has changed since these results were made: the curve and the figures are older.");
+  return note("warn", "The project has changed since these results were made: the figures and the files are older.");
 }
 
 /** @param {boolean} done */
