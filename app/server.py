@@ -12,7 +12,7 @@ from types import FrameType
 from typing import Any
 
 import uvicorn
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 from fastapi.responses import FileResponse, RedirectResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
@@ -148,28 +148,33 @@ def _add_pages(app: FastAPI) -> None:
     @app.get("/p/{project_id}")
     def first_open_step(project_id: str, here: Here) -> RedirectResponse:
         """Lead to the first step that is not done."""
-        folder = here.workspace.open(project_id)
         try:
+            folder = here.workspace.open(project_id)
             steps = steps_of(here, folder, folder.load().project, look=False).steps
             step = next((name for name in STEPS if steps[name]["status"] not in SETTLED), STEPS[-1])
-        except InputError:
+        except (InputError, Missing):
             step = STEPS[0]
         return RedirectResponse(f"/p/{project_id}/{step}")
 
     @app.get("/p/{project_id}/{step}")
-    def page(project_id: str, step: str, here: Here) -> FileResponse:
-        """Return the page of a step."""
-        here.workspace.open(project_id)
+    def page(project_id: str, step: str, here: Here, request: Request) -> FileResponse:
+        """Return the page of a step; to people it says itself that its project is not there."""
         if step not in STEPS:
             raise Missing(f"{step}: there is no such page.", path=step)
+        try:
+            here.workspace.open(project_id)
+        except Missing:
+            if "text/html" not in request.headers.get("accept", ""):
+                raise
+            return _page(step, status_code=404)
         return _page(step)
 
 
-def _page(name: str) -> FileResponse:
+def _page(name: str, *, status_code: int = 200) -> FileResponse:
     file = STATIC / f"{name}.html"
     if not file.is_file():
         raise Missing(f"{name}: there is no such page.", path=name)
-    return FileResponse(file, media_type="text/html", headers={"Cache-Control": "no-cache"})
+    return FileResponse(file, status_code, media_type="text/html", headers={"Cache-Control": "no-cache"})
 
 
 class _Server(uvicorn.Server):

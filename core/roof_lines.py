@@ -143,7 +143,7 @@ class LineTracker:
         self._half_band = max(6, int(np.ceil(width_px / 2)))
         section = self._section(luma, to_raw(self.axis_points), self._half_band + 4)
         if section is None:
-            raise InputError(f"{name} lies outside the reference frame; move it onto the roof.")
+            raise InputError(f"{name} lies outside the reference frame or is too short; lay it along a strip.")
         self.profile = _find_strip(section, self._half_band, name)
         context = (len(self.profile.signature) - 1) // 2
         self._reach = self._half_band + context + int(np.ceil(abs(self.profile.tilt_px))) + 1

@@ -131,6 +131,15 @@ def eventually(holds: Callable[[], bool], seconds: float = 20.0) -> None:
         time.sleep(0.1)
 
 
+def arrived(page: Page, held: list[Any]) -> Any:
+    """Wait for what a page asks, and return it."""
+    for _ in range(500):
+        if held:
+            return held[0]
+        page.wait_for_timeout(20)  # in which the page's questions are taken
+    raise AssertionError("nothing came in time")
+
+
 def ask(pages: str, path: str) -> Any:
     """Return what the server answers about a project, given the address of its pages."""
     with urllib.request.urlopen(f"{pages.replace('/p/', '/api/projects/')}/{path}".rstrip("/")) as answer:

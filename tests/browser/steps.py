@@ -67,7 +67,7 @@ def new_project(page: Page, address: str, name: str, folder: str, kinds: Sequenc
         if files.get_by_role("option", name=folder).count() or kind == kinds[0]:
             files.get_by_role("option", name=folder).click()
         files.get_by_role("option", name=FILES[kind]).dblclick()
-    page.get_by_role("button", name="Create").click()
+    page.get_by_role("button", name="Create").dblclick()  # as people do; it is one project all the same
     page.wait_for_url(f"**/p/{name}/inputs")
     for kind in kinds:
         badge = page.locator(f".input-card[data-kind={kind}] .badge")

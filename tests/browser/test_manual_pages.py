@@ -16,7 +16,7 @@ from playwright.sync_api import APIResponse, Page, Route, expect
 from core.lens import read_lens
 from core.project import read_project
 from tests.browser.hands import centre_of, fitted, zoomed
-from tests.browser.live import SAMPLE, ask, ask_bytes, eventually, watched
+from tests.browser.live import SAMPLE, arrived, ask, ask_bytes, eventually, watched
 from tests.browser.steps import (
     FRAME_SIZE,
     draw_bands,
@@ -243,15 +243,6 @@ def of_project(pages: str) -> str:
     return pages.replace("/p/", "/api/projects/")
 
 
-def arrived(page: Page, held: list):
-    """Wait for what a page asks, and return it."""
-    for _ in range(500):
-        if held:
-            return held[0]
-        page.wait_for_timeout(20)
-    raise AssertionError("nothing came in time")
-
-
 @contextmanager
 def first_answer_held(page: Page, pages: str) -> Iterator[None]:
     """Have the server take the next edit of a page at once, and the page hear of it only when this ends."""
@@ -415,7 +406,17 @@ def test_a_target_is_measured_relative_to_another(browser, project):
         page.get_by_role("button", name="Actions for table").click()
         page.get_by_role("menuitem", name="Delete").click()
         saved(page)
-    assert [(target.name, target.relative_to) for target in read_project(folder).targets] == [("roof", None)]
+        assert [(target.name, target.relative_to) for target in read_project(folder).targets] == [("roof", None)]
+        page.get_by_role("button", name="Add target").click()
+        page.get_by_role("menuitem", name="Three lines").click()
+        relative.select_option("roof")  # of a target still being drawn
+        act(page, page.locator("#targets li[data-target=roof]"), "Rename…", name="top")
+        page.locator("#targets li[data-target=table]").click()
+        expect(relative).to_have_value("top")
+        act(page, page.locator("#targets li[data-target=top]"), "Delete")
+        page.locator("#targets li[data-target=table]").click()
+        expect(relative).to_have_value("")
+        saved(page)
 
 
 def test_the_columns_of_another_gps_file_are_told(browser, project):
@@ -487,6 +488,14 @@ def test_the_engines_sentences_are_told_in_words_of_the_pages(browser, project):
         ),
         "project.json: correspondences: id 3: frame_px [1, 2] is outside the 3 x 4 frame; click it again.": (
             "Correspondences: pair 3: [1, 2] is outside the 3 x 4 frame; click it again.",
+            "correspondences",
+        ),
+        "correspondence 5 lies where the lens model ends; move or disable it.": (
+            "Pair 5 lies where the lens model ends; move or disable it.",
+            "correspondences",
+        ),
+        "no correspondence is enabled, at least four are needed.": (
+            "No correspondence is enabled, at least four are needed.",
             "correspondences",
         ),
         "/w/p/gps.csv: is empty; export it again.": ("gps.csv: is empty; export it again.", None),
@@ -586,6 +595,11 @@ def test_what_is_missing_is_named_with_the_way_to_it(browser, project, server):
         expect(page.get_by_text("Nothing was placed.")).to_be_attached()
         page.goto(f"{pages}/orthoimage")
         expect(page.get_by_role("button", name="Make the orthoimage")).to_be_disabled()
+        page.get_by_label("west", exact=True).fill("-5")
+        page.keyboard.press("Enter")
+        expect(page.locator("#raster .hint")).to_have_text(
+            "Give south, east and north too: until then, the extent stays as it was."
+        )
         made = page.request.post(
             f"{address}/api/projects", data={"name": "bare"}, headers={"X-Rooftrack": "1", "Origin": address}
         ).json()["id"]
@@ -714,6 +728,7 @@ def test_projects_are_copied_renamed_archived_restored_and_deleted_with_undo(bro
         card = page.locator(f"[data-project='{folder.name}']")
         act(page, card, "Rename…", name="Sample by hand")
         expect(card.get_by_role("heading")).to_have_text("Sample by hand")
+        expect(card.locator(".folder")).to_have_text(f"in folder {folder.name}")
         act(page, card, "Duplicate…", name="A copy of it")
         expect(page.get_by_role("heading", name="A copy of it")).to_be_visible()
         with page.expect_download() as download:

@@ -15,7 +15,7 @@ from core.drift import high_pass
 from core.project import read_project
 from core.results import read_history_csv
 from core.run import run_project
-from tests.browser.live import ask, eventually, folder_name, free_port, serving, watched
+from tests.browser.live import arrived, ask, eventually, folder_name, free_port, serving, watched
 from tests.browser.steps import FRAME_SIZE
 
 FRAMES = 600
@@ -46,9 +46,10 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
     port = free_port()
     with serving(tmp_path, port) as address, watched(browser, address) as page:
         page.goto(f"{address}/p/sample/track")
-        page.get_by_role("button", name="Start").click()
+        page.get_by_role("button", name="Start").dblclick()  # as people do; it is started once
         page.wait_for_function("() => parseInt(document.querySelector('.figures .value')?.textContent) > 5")
         expect(page.locator("[data-step=track]")).to_have_attribute("data-status", "running")
+        expect(page.locator(".toast")).to_have_count(0)
         page.get_by_role("button", name="Cancel").click()
         expect(page.locator("[data-step=track]")).to_have_attribute("data-status", "warn")
         expect(page.get_by_role("button", name="Resume")).to_be_visible()
@@ -130,9 +131,9 @@ def test_an_answer_from_before_a_method_was_chosen_is_not_taken_for_the_new_one(
         page.route("**/results", hold_the_second)  # a page asks at once, and when its events begin
         page.goto(f"{pages}/track")
         expect(page.get_by_role("link", name="Review the result")).to_be_visible(timeout=30_000)
+        route, answer = arrived(page, held)
         page.get_by_role("radio", name="Paper").click()
         expect(page.locator(".note.info")).to_contain_text("Not measured by this method yet")
-        route, answer = held[0]
         route.fulfill(response=answer)
         page.wait_for_timeout(1000)
         expect(page.locator(".note.info")).to_contain_text("Not measured by this method yet")
@@ -391,6 +392,11 @@ def test_the_interval_of_rest_is_dragged_on_the_plot(browser, project):
         handle.press("Shift+ArrowLeft")
         expect(handle).to_have_attribute("aria-valuenow", f"{end - 1:.2f}")
         eventually(lambda: read_project(folder).intervals_s.pre_event[1] == pytest.approx(end - 1, abs=0.002))
+        field = page.get_by_role("textbox", name="Residual to")
+        field.fill("500")
+        field.press("Enter")
+        expect(page.get_by_role("alert")).to_have_text(re.compile(r"The video ends at [\d.]+ s\."))
+        expect(field).to_have_attribute("aria-invalid", "true")
 
 
 def test_table_2_says_what_the_summary_says(browser, headless, finished):

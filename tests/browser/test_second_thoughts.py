@@ -10,8 +10,8 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from core.project import read_project
-from tests.browser.hands import click_at, fitted
-from tests.browser.live import ask, watched
+from tests.browser.hands import click_at, drawn, fitted
+from tests.browser.live import ask, eventually, watched
 from tests.browser.steps import FRAME_SIZE, NO_DOUBLE_CLICK_MS, make_orthoimage, ortho_px, pane, ready, saved
 
 
@@ -64,7 +64,14 @@ def test_undo_takes_back_what_was_done_last(browser, project):
         expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(19)
         expect(half).to_have_count(1)
         saved(page)
-    assert [pair.id for pair in read_project(folder).correspondences] == [1, 2, *range(4, 21)]
+        assert [pair.id for pair in read_project(folder).correspondences] == [1, 2, *range(4, 21)]
+        for _ in range(5):  # faster than it is answered, and more than there is
+            page.keyboard.press("Control+z")
+        expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(20)
+        expect(page.get_by_role("button", name="Undo (Ctrl+Z)")).to_be_disabled()
+        expect(page.locator(".toast")).to_have_count(0)
+        saved(page)
+    assert [pair.id for pair in read_project(folder).correspondences] == [*range(1, 21)]
 
 
 def test_a_band_is_drawn_again_over_the_old_one(browser, project):
@@ -163,10 +170,10 @@ def test_a_number_field_says_what_it_takes(browser, project):
             page.goto(f"{pages}/correspondences")
         ready(page, "Reference frame")
         field, words = page.get_by_label("Reference frame", exact=True), page.get_by_role("alert")
-        for typed in ("9999", "abc"):
+        for typed in ("9999", "abc", "3.5"):
             field.fill(typed)
             page.keyboard.press("Enter")
-            expect(words).to_have_text("A number from 0 to 599, please.")
+            expect(words).to_have_text("A whole number from 0 to 599, please.")
             page.keyboard.press("Escape")
             expect(field).to_have_value("0")
         field.press("ArrowDown")
@@ -225,6 +232,10 @@ def test_a_click_completes_the_oldest_half_or_the_one_picked_out(browser, projec
         click_share(page, (0.06, 0.5))
         expect(page.locator("#selection h2")).to_have_text("Pair 22, unfinished")
         expect(hint).to_have_text("Click completes pair 22")
+        page.wait_for_timeout(NO_DOUBLE_CLICK_MS)
+        click_share(page, (0.5, -0.1))  # beside the picture
+        expect(page.locator(".toast")).to_contain_text("click within the picture")
+        expect(page.locator("#selection h2")).to_have_text("Pair 22, unfinished")
 
 
 def test_residuals_are_as_long_in_both_pictures_and_say_how_enlarged(browser, project):
@@ -263,12 +274,12 @@ def test_the_loupe_shows_the_picture_that_is_shown(browser, project):
         page.mouse.move(*np.round(lies.window(np.array(FRAME_SIZE) * [0.1, 0.9])))
         loupe = pane(page, "Reference frame").locator(".loupe canvas")
         pixels = "canvas => canvas.toDataURL()"
-        page.wait_for_timeout(300)
+        expect(loupe).to_be_visible()
+        drawn(page, pane(page, "Reference frame"), lies.scale)
         before = loupe.evaluate(pixels)
         page.keyboard.press("u")
         expect(page.locator(".pane-chip", has_text="undistorted")).to_be_visible()
-        page.wait_for_timeout(300)
-        assert loupe.evaluate(pixels) != before
+        eventually(lambda: loupe.evaluate(pixels) != before)
 
 
 def test_the_fit_stays_where_it_is_when_a_pair_is_switched_off(browser, project):
@@ -300,4 +311,7 @@ def test_a_look_at_what_is_not_there_yet_is_no_error(browser, project):
         expect(page.get_by_role("button", name="Start")).to_be_visible()
         page.goto(f"{pages}/export")
         expect(page.get_by_role("heading", name="Nothing measured yet")).to_be_visible()
-    assert refused == []
+        assert refused == []
+        page.goto(f"{address}/p/deleted-meanwhile")
+        expect(page.locator("#main")).to_contain_text("there is no such project")
+        expect(page.get_by_role("link", name="All projects")).to_be_visible()

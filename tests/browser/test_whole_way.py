@@ -48,6 +48,7 @@ def test_from_four_files_to_the_csv_that_the_headless_engine_writes(browser, ser
         tell_intervals(page, pages, decided)
         sweep_corners(page, pages)
         downloaded = download(page, pages, folder, headless)
+    assert not folder.with_name("first-try-2").exists()
     made = read_project(folder)
     aimed = np.array([pair.frame_px for pair in decided.correspondences])
     missed = np.array([pair.frame_px for pair in made.correspondences]) - aimed

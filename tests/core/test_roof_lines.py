@@ -197,7 +197,7 @@ def test_a_band_without_two_edges_is_refused(grey: Floats) -> None:
 
 
 def test_a_band_beyond_the_reference_frame_is_refused() -> None:
-    with pytest.raises(InputError, match=r"roof\.L1 lies outside the reference frame; move it"):
+    with pytest.raises(InputError, match=r"roof\.L1 lies outside the reference frame or is too short"):
         tracker(ends=DRAWN + [0.0, 500.0])
 
 

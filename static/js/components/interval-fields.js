@@ -1,6 +1,7 @@
 // The three intervals of a measurement in numbers: pre-event, event, residual.
 
 import { fill, h } from "../lib/dom.js";
+import { fixed } from "../lib/format.js";
 import { numberField } from "./number-field.js";
 
 /** @typedef {"pre_event" | "event" | "residual"} IntervalName */
@@ -17,8 +18,9 @@ export const INTERVALS = [
  * Fields for start and end of each interval.
  * @param {HTMLElement} host
  * @param {(name: IntervalName, interval: Seconds) => void} onChange null: the interval is taken away
+ * @param {() => number} end_s where the video ends
  */
-export function intervalFields(host, onChange) {
+export function intervalFields(host, onChange, end_s) {
   /** @type {Map<IntervalName, Seconds>} */
   const current = new Map();
   const rows = INTERVALS.map(({ name, label, colour, hint }) => {
@@ -36,6 +38,8 @@ export function intervalFields(host, onChange) {
         decimals: 2,
         step: 0.1,
         min: 0,
+        max: end_s,
+        tooGreat: () => `The video ends at ${fixed(end_s(), 2)} s.`,
         optional: true,
         compact: true,
         bare: true,

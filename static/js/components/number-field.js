@@ -10,7 +10,7 @@ import { fieldWords } from "./field-words.js";
  * @property {string} unit
  * @property {number | null} value
  * @property {(value: number | null) => void} onChange  on Enter, on leaving, and on each step
- * @property {number} [decimals]
+ * @property {number} [decimals]  0: whole numbers only
  * @property {number} [step]
  * @property {number} [min]
  * @property {number | (() => number)} [max]  a function where it is known later
@@ -33,6 +33,7 @@ export function numberField(options) {
   let current = options.value;
 
   const written = () => (current === null ? "" : current.toFixed(decimals));
+  const isWhole = decimals === 0;
   const refuse = (/** @type {number} */ value) =>
     words.say(options.tooGreat && value > greatest() ? options.tooGreat() : permitted(min, greatest(), decimals, unit));
   const show = () => {
@@ -49,7 +50,8 @@ export function numberField(options) {
     const text = plainNumber(input.value);
     if (text === "" && optional) return take(null);
     const value = Number(text);
-    if (text === "" || !Number.isFinite(value) || value < min || value > greatest()) {
+    const isOther = text === "" || !Number.isFinite(value) || (isWhole && !Number.isInteger(value));
+    if (isOther || value < min || value > greatest()) {
       input.setAttribute("aria-invalid", "true");
       return refuse(value);
     }
@@ -57,7 +59,7 @@ export function numberField(options) {
     take(value);
   };
   const turn = (/** @type {number} */ steps) => {
-    const wanted = Number(((current ?? 0) + steps * step).toFixed(8));
+    const wanted = Number(((current ?? 0) + steps * step).toFixed(isWhole ? 0 : 8));
     take(Math.min(greatest(), Math.max(min, wanted)));
     if (wanted !== current) refuse(wanted);
   };
@@ -132,5 +134,5 @@ function permitted(min, max, decimals, unit) {
   const [least, most] = [min, max].map((value) => fixed(value, value % 1 === 0 ? 0 : decimals));
   const range = Number.isFinite(min) && Number.isFinite(max) ? `from ${least} to ${most}` : "";
   const half = Number.isFinite(min) ? `of at least ${least}` : Number.isFinite(max) ? `of at most ${most}` : "";
-  return ["A number", range || half, range || half ? unit : ""].filter(Boolean).join(" ") + ", please.";
+  return [decimals === 0 ? "A whole number" : "A number", range || half, range || half ? unit : ""].filter(Boolean).join(" ") + ", please.";
 }

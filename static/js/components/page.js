@@ -44,7 +44,7 @@ export async function openPage(step) {
     return { id, step, store, events, keys: bindKeys };
   } catch (error) {
     showDeadEnd(sentence(error));
-    throw error;
+    return new Promise(() => undefined); // the page goes no further
   }
 }
 
@@ -103,5 +103,7 @@ function showDeadEnd(message) {
     h("p", {}, message),
     h("a", { class: "button primary", href: "/" }, "All projects"),
   );
-  fill(find("#main"), h("div", { class: "page" }, box));
+  const main = find("#main");
+  main.className = "page";
+  fill(main, box);
 }

@@ -14,7 +14,8 @@ const PLACES = [
   { place: /^inputs/, name: "Inputs", step: "inputs" },
   { place: /^orthoimage/, name: "Orthoimage", step: "orthoimage" },
   { place: /^reference_frame/, name: "Reference frame", step: "correspondences" },
-  { place: /^correspondences?/, name: "Correspondences", step: "correspondences" },
+  { place: /^correspondence\b/, name: "Pair", step: "correspondences" },
+  { place: /^correspondences/, name: "Correspondences", step: "correspondences" },
   { place: /^moving_regions_px/, name: "Moving regions", step: "regions" },
   { place: new RegExp(`${OF_TARGET}\\.lines\\.(L1|L2|T1)`), name: "Band $2", step: "regions" },
   { place: new RegExp(`${OF_TARGET}\\.lines`), name: "Bands", step: "regions" },
@@ -37,6 +38,8 @@ const SAID_HERE = [
   [/correct inputs\.gps\.file of project\.json or set inputs\.gps to null/g, "choose the record again or remove it"],
   [/correct inputs\.video or put the file there/g, "choose the video again"],
   [/or set inputs\.gps to null/g, "or remove it"],
+  [/\bin pre_event\b/g, "in the pre-event interval"],
+  [/\banother pre_event\b/g, "another pre-event interval"],
   [/\bin ground_m\b/g, "on the ground"],
   [/\bin frame_px\b/g, "in the frame"],
   [/\borthoimage\.extent_m\b/g, "the orthoimage's extent"],
@@ -63,8 +66,11 @@ export function told(message, path = null) {
   const said = SAID_HERE.reduce((words, [theirs, ours]) => words.replace(theirs, ours), named);
   const words = ABOUT_FOLDERS.test(said) ? said : said.replace(WHOLE_PATH, "$1$2");
   const step = found?.step ?? REMEDIES.find(([remedy]) => remedy.test(words))?.[1] ?? stepOf(path);
-  return { words, step };
+  return { words: begun(words), step };
 }
+
+/** With a capital, unless it begins with the name of something. @param {string} words */
+const begun = (words) => words.replace(/^[a-z](?=[a-z]* )/, (letter) => letter.toUpperCase());
 
 /** @param {string | null} path place in project.json @returns {StepName | null} */
 const stepOf = (path) => PLACES.find(({ place }) => place.test(path ?? ""))?.step ?? null;

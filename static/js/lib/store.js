@@ -101,6 +101,7 @@ export class ProjectStore extends Emitter {
   /** @param {"undo" | "redo"} which */
   #step(which) {
     return this.#then(async () => {
+      if (!this.state[`can_${which}`]) return; // asked for faster than answered: those before took the last one
       try {
         this.#adopt(await post(projectPath(this.id, which), { revision: this.revision }), "undo");
       } catch (error) {

@@ -99,6 +99,7 @@ export class Targets extends Emitter {
     if (!this.store.project.targets.some((target) => target.name === from)) {
       return this.#keepOpen(this.#open.map((target) => (target.name === from ? { ...target, name: to } : target)));
     }
+    this.#refer(from, to);
     void this.store.edit(`Rename ${from} to ${to}`, (draft) => {
       for (const target of draft.targets) {
         if (target.name === from) target.name = to;
@@ -111,10 +112,17 @@ export class Targets extends Emitter {
   remove(name) {
     if (!this.store.project.targets.some((target) => target.name === name))
       return this.#keepOpen(this.#open.filter((target) => target.name !== name));
+    this.#refer(name, null);
     void this.store.edit(`Delete target ${name}`, (draft) => {
       draft.targets = draft.targets.filter((target) => target.name !== name);
       for (const target of draft.targets) if (target.relative_to === name) target.relative_to = null;
     });
+  }
+
+  /** Have targets still being drawn follow the one they are relative to. @param {string} from @param {string | null} to */
+  #refer(from, to) {
+    const led = (/** @type {string | null} */ name) => (name === from ? to : name);
+    this.#keepOpen(this.#open.map((target) => ({ ...target, relative_to: led(target.relative_to) })));
   }
 
   /** @param {OpenTarget[]} open */

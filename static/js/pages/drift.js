@@ -1,6 +1,6 @@
 // Drift: how much the camera's own motion is left in the history, and what a filter would take away with it.
 
-import { get, post, projectPath } from "../lib/api.js";
+import { get, post, projectPath, sentence } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { fixed, millimetres } from "../lib/format.js";
 import { latest } from "../lib/latest.js";
@@ -142,14 +142,17 @@ const spectrumPlot = new Plot(lowerArea, {
 });
 const filtering = h("span", { class: "badge accent", role: "status", hidden: true }, "Solving…");
 solving.before(filtering);
-const fields = intervalFields(intervalBox, saveInterval);
+const fields = intervalFields(intervalBox, saveInterval, end_s);
 const refilter = latest(askFilter, showAnswer, (error) => (opened(), (filtering.hidden = true), toastError(error)));
 const resweep = latest(askSweep, showSweep, (error) => showSweepProblem(error));
 const respectrum = latest(askSpectra, showSpectra, () => undefined);
 const solver = new Solver(
   page,
   () => results.ready && !results.stale,
-  (busy) => (solving.hidden = !busy),
+  (busy) => {
+    solving.hidden = !busy;
+    if (busy) filtering.hidden = true; // one word for both
+  },
 );
 
 history.on("select", ({ from, to }) => saveInterval("pre_event", [from, to]));
@@ -285,7 +288,7 @@ function filterAnew() {
   if (awaited.length === 0 && answer !== null)
     awaited = [
       window.setTimeout(() => setFaint(true), FAINT_AFTER_MS),
-      window.setTimeout(() => (filtering.hidden = false), TOLD_AFTER_MS),
+      window.setTimeout(() => (filtering.hidden = !solving.hidden), TOLD_AFTER_MS),
     ];
   refilter(corner_hz);
 }
@@ -342,6 +345,12 @@ function showAnswer(newest) {
   );
 }
 
+/** Where the video ends: with its last frame's own duration. */
+function end_s() {
+  const [before, last] = answer?.time_s.slice(-2) ?? [];
+  return last === undefined ? Infinity : 2 * last - before;
+}
+
 function drawHistory() {
   if (answer === null) return;
   const key = axis === "x" ? "dx" : "dy";
@@ -387,7 +396,7 @@ function showSweepProblem(error) {
   sweep = null;
   kneeButton.hidden = true;
   kneeWords.hidden = false;
-  kneeWords.textContent = error instanceof Error ? error.message : String(error);
+  kneeWords.textContent = sentence(error);
 }
 
 function showNoInterval() {

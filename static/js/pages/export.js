@@ -112,7 +112,8 @@ await reload().catch(toastError);
 
 /** What the files say comes first; the curves follow, since the engine may have to solve for them. */
 async function reload() {
-  results = await fetchResults(page.id);
+  const done = busyOver(overlayBox, "Reading the results…");
+  results = await fetchResults(page.id).finally(done);
   problem = "";
   showAll();
   await loadCurves();

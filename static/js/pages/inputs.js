@@ -39,7 +39,7 @@ const KINDS = /** @type {const} */ ([
     kind: "cloud",
     title: "Point cloud",
     glyph: "cube",
-    accept: ".las,.laz,.ply,.pcd,.xyz,.pts,.txt,.csv,.e57",
+    accept: ".las,.laz,.ply,.pcd,.xyz,.asc,.pts,.txt,.csv,.e57",
     why: "A LiDAR cloud of the site: it ties the picture to metres and gives the roof's height.",
   },
   {

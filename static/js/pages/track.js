@@ -6,6 +6,7 @@ import { count, duration, fixed, millimetres, pixels, plural } from "../lib/form
 import { icon } from "../lib/icons.js";
 import { told } from "../lib/problems.js";
 import { setView, viewText } from "../lib/view-state.js";
+import { busyOver } from "../components/busy.js";
 import { stepUrl } from "../components/header.js";
 import { AXES, fetchHistory, fetchResults, methodName, METHODS } from "../components/histories.js";
 import { isRunning } from "../components/job-card.js";
@@ -42,6 +43,7 @@ const rows = new Map();
 let results = null;
 let target = viewText("target") ?? "";
 let duration_s = 0;
+let starting = false;
 let drawing = 0;
 
 const targetChoice = segmented({ label: "Target", choices: [], value: target, onChange: chooseTarget });
@@ -101,7 +103,9 @@ page.events.on("online", show);
 page.events.on("job", onJob);
 page.events.on("track", addRows);
 page.events.on("results", () => void loadResults());
+const opened = busyOver(find(".stage-body"), "Reading the results…");
 await catchUp();
+opened();
 await loadDuration();
 
 /** Ask for the whole state: at first, and whenever the connection was lost. */
@@ -162,7 +166,7 @@ function onJob(job) {
   track = { ...track, job };
   if (ended) {
     announce(job.state === "done" ? "The measurement is finished." : `The measurement stopped. ${told(job.message ?? "").words}`);
-    void catchUp();
+    return void catchUp(); // what was kept, and so what can be done next, is not known before
   }
   show();
 }
@@ -182,6 +186,8 @@ function keep(name, row) {
 
 /** @param {boolean} fresh measure again from the first frame */
 async function start(fresh) {
+  if (starting) return; // a double click
+  starting = true;
   try {
     if (fresh || !track.resumable) rows.clear();
     await store.settled();
@@ -190,11 +196,18 @@ async function start(fresh) {
   } catch (error) {
     toastError(error);
   }
+  starting = false;
   show();
 }
 
 async function cancel() {
-  await remove(projectPath(page.id, "track")).catch(toastError);
+  try {
+    const { job } = await remove(projectPath(page.id, "track"));
+    if (job?.id === track.job?.id && isRunning(track.job)) track = { ...track, job };
+  } catch (error) {
+    toastError(error);
+  }
+  show();
 }
 
 /** @param {string} name */
@@ -258,7 +271,7 @@ function showControls() {
     problems.length === 0 && track.resumable ? note("info", stoppedWords()) : null,
     problems.length === 0 && !track.resumable && results?.ready ? earlierNote() : null,
     done && job?.state !== "failed" ? note("good", doneWords()) : null,
-    ...(done ? (results?.summary?.warnings ?? []) : []).map((/** @type {string} */ warning) => note("warn", warning)),
+    ...(done ? (results?.summary?.warnings ?? []) : []).map((/** @type {string} */ warning) => note("warn", told(warning).words)),
   ];
   fill(controls, h("header", {}, h("h2", {}, "Measurement")), notes, buttons(Boolean(done)));
 }
@@ -276,7 +289,7 @@ function earlierNote() {
   if (!isMeasured())
     return note("info", `Not measured by this method yet. The faint curve is the one of the ${of} method.`);
   if (!results?.stale) return null;
-  return note("warn", "The project has changed since these results were made: the curve and the figures are older.");
+  return note("warn", "The project has changed since these results were made: the figures and the files are older.");
 }
 
 /** @param {boolean} done */
@@ -306,13 +319,14 @@ function buttons(done) {
 /** @param {Job} job */
 function showRunning(job) {
   const share = job.total > 0 ? job.done / job.total : null;
+  const stopping = job.message !== ""; // a running job says nothing else
   const { online } = page.events; // what is heard no more stands still, and is not told as going on
   const stage = STAGES[job.stage] ?? (job.stage || "Starting");
   const title = online ? stage : "Connection lost";
   const bar = h("progress", { max: 1, "aria-label": "Progress", value: share, class: online ? null : "frozen" });
   const stop = h(
     "button",
-    { type: "button", class: "button", disabled: !online, onclick: () => void cancel() },
+    { type: "button", class: "button", disabled: !online || stopping, onclick: () => void cancel() },
     icon("close"),
     "Cancel",
   );
@@ -329,9 +343,11 @@ function showRunning(job) {
     h(
       "p",
       { class: "small faint" },
-      online
-        ? "You may close this tab: the measurement goes on, and every frame is kept."
-        : "Every frame measured so far is kept; once the server is back, the measurement goes on from there.",
+      stopping
+        ? job.message
+        : online
+          ? "You may close this tab: the measurement goes on, and every frame is kept."
+          : "Every frame measured so far is kept; once the server is back, the measurement goes on from there.",
     ),
     h("div", { class: "toolbar" }, stop),
   );

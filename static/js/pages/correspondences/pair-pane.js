@@ -3,7 +3,8 @@
 import { Pane } from "../../components/pane.js";
 import { Loupe } from "../../components/loupe.js";
 import { paneChrome } from "../../components/pane-chrome.js";
-import { add, times } from "../../lib/coordinates.js";
+import { toast } from "../../components/toast.js";
+import { add, distance, times } from "../../lib/coordinates.js";
 import { Emitter } from "../../lib/emitter.js";
 import { fixed } from "../../lib/format.js";
 import { setView, viewNumbers } from "../../lib/view-state.js";
@@ -186,7 +187,7 @@ export class PairPane extends Emitter {
     const id = this.slots.selected;
     const from = id === null ? undefined : this.shown.get(id);
     if (id === null || from === undefined) return;
-    const to = add(from, delta);
+    const to = this.#within(add(from, delta));
     this.shown.set(id, to);
     this.loupe.show(to);
     this.#store(to, (stored) => this.slots.move(id, this.side, stored, true));
@@ -202,14 +203,17 @@ export class PairPane extends Emitter {
     const idOf = (/** @type {string} */ shapeId) => Number(shapeId.slice("pair-".length));
     pane.on("click", ({ point }) => this.#place(point));
     pane.on("select", ({ id }) => this.slots.select(idOf(id)));
-    pane.on("drag", ({ id, point }) => {
+    pane.on("drag", ({ id, point: at }) => {
+      const point = this.#within(at);
       this.shown.set(idOf(id), point);
       if (this.slots.selected !== idOf(id)) this.slots.select(idOf(id));
       this.draw();
       const stored = this.mapping.stored(point);
       if (!(stored instanceof Promise)) this.emit("moving", { id: idOf(id), side: this.side, point: stored });
     });
-    pane.on("drop", ({ id, point }) => this.#store(point, (stored) => this.slots.move(idOf(id), this.side, stored)));
+    pane.on("drop", ({ id, point }) =>
+      this.#store(this.#within(point), (stored) => this.slots.move(idOf(id), this.side, stored)),
+    );
     pane.on("cancel", () => this.refresh());
     pane.on("view", () => this.draw());
     pane.element.addEventListener("keydown", ({ key }) => this.#aimsBy(key) && this.#setAim(true));
@@ -227,7 +231,15 @@ export class PairPane extends Emitter {
 
   /** @param {Point} point px shown */
   #place(point) {
-    if (this.pane.image !== null) this.#store(point, (stored) => this.slots.place(this.side, stored));
+    if (this.pane.image === null) return;
+    if (distance(point, this.#within(point)) > 0) return void toast("Nothing was placed: click within the picture.");
+    this.#store(point, (stored) => this.slots.place(this.side, stored));
+  }
+
+  /** The place in the picture nearest to a point. @param {Point} point px shown @returns {Point} */
+  #within([u, v]) {
+    const { width, height } = this.pane.image ?? { width: Infinity, height: Infinity };
+    return [Math.min(Math.max(u, -0.5), width - 0.5), Math.min(Math.max(v, -0.5), height - 0.5)];
   }
 
   /** In the order made, though the server may have to be asked. @param {Point} shown @param {(stored: Point) => void} use */

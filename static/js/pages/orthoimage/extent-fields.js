@@ -12,8 +12,16 @@ const SIDES = ["west", "south", "east", "north"];
 export function extentFields(onChange) {
   /** @type {(number | null)[]} */
   let typed = [null, null, null, null];
+  const missing = h("p", { class: "hint", role: "status" });
+  const tellMissing = () => {
+    const left = SIDES.filter((_, i) => typed[i] === null);
+    const partly = left.length > 0 && left.length < SIDES.length;
+    missing.hidden = !partly;
+    missing.textContent = partly ? `Give ${new Intl.ListFormat("en-GB").format(left)} too: until then, the extent stays as it was.` : "";
+  };
   const take = (/** @type {number} */ side, /** @type {number | null} */ value) => {
     typed = typed.with(side, value);
+    tellMissing();
     const [west, south, east, north] = typed;
     if (west !== null && south !== null && east !== null && north !== null) onChange([west, south, east, north]);
     else if (typed.every((entry) => entry === null)) onChange(null);
@@ -32,12 +40,18 @@ export function extentFields(onChange) {
   return {
     element: h(
       "div",
-      { class: "field-row" },
-      fields.map((field) => field.element),
+      { class: "field" },
+      h(
+        "div",
+        { class: "field-row" },
+        fields.map((field) => field.element),
+      ),
+      missing,
     ),
     /** @param {Extent | null} extent @param {Extent | null} made of the orthoimage as it is */
     show(extent, made) {
       typed = extent === null ? [null, null, null, null] : [...extent];
+      tellMissing();
       fields.forEach((field, i) => {
         field.set(typed[i]);
         field.input.placeholder = made === null ? "–" : fixed(made[i], 2);

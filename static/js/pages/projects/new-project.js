@@ -1,7 +1,7 @@
 // A new project: its name, and the files it starts from, by their place on this computer or sent by the browser.
 
 import { post, sentence } from "../../lib/api.js";
-import { h } from "../../lib/dom.js";
+import { fill, h } from "../../lib/dom.js";
 import { icon } from "../../lib/icons.js";
 import { dialogActions, openDialog } from "../../components/dialog.js";
 import { chooseFiles } from "../../components/file-browser.js";
@@ -26,13 +26,16 @@ export function newProjectDialog() {
         chosen[kind] = path;
         if (name.value === "" && kind === "video") name.value = stem(path);
       };
+      const create = h("button", { class: "button primary", type: "submit" }, "Create");
       const submit = async (/** @type {Event} */ event) => {
         event.preventDefault();
+        create.disabled = true; // a double click makes one project; Enter obeys this too
         try {
           close((await post("projects", { name: name.value.trim(), ...chosen })).id);
         } catch (error) {
           problem.hidden = false;
           problem.textContent = sentence(error);
+          create.disabled = false;
         }
       };
       const field = h("div", { class: "field" }, h("label", { class: "label", for: name.id }, "Name"), name);
@@ -41,7 +44,7 @@ export function newProjectDialog() {
           "form",
           { class: "dialog-form", onsubmit: submit },
           h("div", { class: "dialog-body" }, field, sourceRows(onChosen), problem),
-          dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, "Create")),
+          dialogActions(() => close(null), create),
         ),
       ];
     },
@@ -79,7 +82,8 @@ function sourceRow({ kind, name, hint }, onChosen) {
   const choose = async () => {
     const files = await chooseFiles({ title: `Choose the ${name.toLowerCase()}`, kind });
     if (files === null) return;
-    path.textContent = files[0];
+    fill(path, h("bdi", {}, files[0])); // cut off at its beginning, so set from the right; its slashes stay in place
+    path.title = files[0];
     path.className = "path";
     onChosen(kind, files[0]);
   };
