@@ -303,7 +303,11 @@ def _add_lens(commands: argparse._SubParsersAction[_Parser]) -> None:
         description="Calibrate a lens from images or a video of a checkerboard and report how well it is known.",
     )
     parser.add_argument(
-        "sources", nargs="+", type=Path, metavar="IMAGE_OR_VIDEO", help="10 to 30 views, tilted, to the edges"
+        "sources",
+        nargs="+",
+        type=Path,
+        metavar="IMAGE_OR_VIDEO",
+        help="10 to 30 views, tilted, to the edges; or a folder of them",
     )
     parser.add_argument(
         "--board", type=_board, required=True, metavar="9x6", help="inner corners along and across the board"

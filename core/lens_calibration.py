@@ -198,12 +198,13 @@ def calibrate_images(images: Iterable[tuple[str, Luma]], board: tuple[int, int],
 def images_of(
     sources: Sequence[Path], progress: Progress = silent, cancel: CancelToken | None = None
 ) -> Iterator[tuple[str, Luma]]:
-    """Yield named grey pictures, one in memory at a time, from picture files and videos.
+    """Yield named grey pictures, one in memory at a time, from picture files, folders of them, and videos.
 
     Raises:
-        InputError: a file cannot be read.
+        InputError: a file cannot be read, or a folder holds no pictures.
     """
-    for done, source in enumerate(sources):
+    files = [file for source in sources for file in (_pictures_in(source) if source.is_dir() else [source])]
+    for done, source in enumerate(files):
         if source.suffix.lower() in IMAGE_SUFFIXES:
             if cancel is not None:
                 cancel.raise_if_cancelled()
@@ -213,7 +214,14 @@ def images_of(
                 if cancel is not None:
                     cancel.raise_if_cancelled()
                 yield name, luma
-        progress("calibration", done + 1, len(sources))
+        progress("calibration", done + 1, len(files))
+
+
+def _pictures_in(folder: Path) -> list[Path]:
+    pictures = sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+    if not pictures:
+        raise InputError(f"{folder}: is a folder without pictures; give checkerboard pictures, or a video.")
+    return pictures
 
 
 def _read_image(path: Path) -> Luma:

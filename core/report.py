@@ -216,12 +216,12 @@ def _gps_table(gps: GpsComparison) -> str:
             _cm(row["video_m"]),
             _cm(row["gps_m"]),
             _cm(row["error_m"]),
-            "–" if row["error_percent"] is None else f"{row['error_percent']:.1f}",
+            "–" if row["error_percent"] is None else _signed(f"{row['error_percent']:z.1f}"),
             *([_cm(row["video_at_gps_m"]), _cm(row["error_at_gps_m"])] if gps.is_coarse else []),
         ]
         for row in gps.table()
     ]
-    lag = f"{gps.lag_s:+.4f} s" + ("" if gps.lag_sigma_s is None else f" (± {gps.lag_sigma_s:.4f} s)")
+    lag = _signed(f"{gps.lag_s:+z.4f} s") + ("" if gps.lag_sigma_s is None else f" (± {gps.lag_sigma_s:.4f} s)")
     rms_x, rms_y = gps.rms_m
     text = (
         f"RMS difference {1000 * rms_x:.2f} mm in x and {1000 * rms_y:.2f} mm in y over {len(gps.time_s)} samples; "
@@ -313,8 +313,8 @@ def _reference_fit(fit: ReferenceFit | None) -> str:
 def _pair_row(pair: PairResidual) -> list[str]:
     return [
         f"{pair.id}" if pair.enabled else f"{pair.id} (off)",
-        *(f"{value:+.2f}" for value in pair.residual_px),
-        *(f"{100 * value:+.2f}" for value in pair.residual_m),
+        *(_signed(f"{value:+z.2f}") for value in pair.residual_px),
+        *(_signed(f"{100 * value:+z.2f}") for value in pair.residual_m),
         "–" if pair.left_out_px is None else f"{pair.left_out_px:.2f}",
         _cm(pair.left_out_m),
     ]
@@ -329,7 +329,7 @@ def _calibration(content: ReportContent) -> str:
             correction.name,
             correction.before,
             correction.after,
-            f"{correction.in_priors:+.2f}" + (" !" if abs(correction.in_priors) > SUSPICIOUS else ""),
+            _signed(f"{correction.in_priors:+z.2f}") + (" !" if abs(correction.in_priors) > SUSPICIOUS else ""),
         ]
         for correction in content.corrections
     ]
@@ -361,7 +361,12 @@ def _limitations(project: Project) -> list[str]:
 
 
 def _cm(value_m: float | None) -> str:
-    return "–" if value_m is None else f"{100 * value_m:.2f}"
+    return "–" if value_m is None else _signed(f"{100 * value_m:z.2f}")
+
+
+def _signed(number: str) -> str:
+    """Return a number with the minus sign of the pages, in which a hyphen joins words."""
+    return number.replace("-", "−")
 
 
 def _section(title: str, *parts: str) -> str:

@@ -10,7 +10,7 @@ import pytest
 
 from core.errors import Cancelled, InputError
 from core.lens import Lens, read_lens, write_lens
-from core.lens_calibration import calibrate, calibrate_images
+from core.lens_calibration import calibrate, calibrate_images, images_of
 from core.progress import CancelToken
 
 BOARD, SQUARE_M = (9, 6), 0.025
@@ -144,6 +144,8 @@ def test_mistakes_get_sentences(tmp_path):
         calibrate_images([photographs()[0], small], BOARD, SQUARE_M)
     with pytest.raises(InputError, match="not found"):
         calibrate([tmp_path / "none.jpg"], board=BOARD, square_m=SQUARE_M)
+    with pytest.raises(InputError, match="is a folder without pictures"):
+        calibrate([tmp_path], board=BOARD, square_m=SQUARE_M)
     (tmp_path / "broken.jpg").write_bytes(b"no picture")
     with pytest.raises(InputError, match=r"broken\.jpg: is no picture"):
         calibrate([tmp_path / "broken.jpg"], board=BOARD, square_m=SQUARE_M)
@@ -161,6 +163,8 @@ def test_files_are_read_and_can_be_stopped(tmp_path):
     # The bundle sums in parallel, in an order of its own: the last digits differ.
     np.testing.assert_allclose(found.lens.camera_matrix, calibration().lens.camera_matrix, rtol=1e-6)
     assert told[-1] == (10, 10)
+    (tmp_path / "notes.txt").write_text("taken indoors")
+    assert [name for name, _ in images_of([tmp_path])] == sorted(file.name for file in files)
     cancel = CancelToken()
     cancel.cancel()
     with pytest.raises(Cancelled):

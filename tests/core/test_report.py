@@ -154,7 +154,7 @@ def test_report_holds_what_a_review_board_needs() -> None:
     for title in ("Warnings", "Results", "Inputs", "Method", "Reference frame", "Ground registration",
                   "Self-calibration", "Camera", "Limitations"):  # fmt: skip
         assert title in page.texts
-    for text in ("79.50", "-21.30", "22.00", "1.20", "0.40", "8 (off)", "+0.87", "-3.40 !",
+    for text in ("79.50", "−21.30", "22.00", "1.20", "0.40", "8 (off)", "+0.87", "−3.40 !",
                  "287 of 300", "812–840", "0 to 9 s"):  # fmt: skip
         assert text in page.texts, text
     worst = max(
