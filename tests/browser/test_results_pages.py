@@ -430,6 +430,9 @@ def test_a_result_from_before_a_change_says_so(browser, project):
         table = page.get_by_label("Peaks and residual")
         expect(table.locator(".note")).to_contain_text("5 frames of the event excluded or lost", timeout=60_000)
         expect(page.get_by_text("from before the change")).to_have_count(0)  # solved anew, as the project stands
+        page.get_by_role("button", name="Update them").click()
+        expect(page.get_by_text("since these files were made")).to_have_count(0, timeout=120_000)
+        assert (folder / "results" / "roof.csv").read_text().count(",excluded,") == 5
     document["targets"][0]["lines"]["L1"]["width_m"] += 0.01
     refused: list[str] = []
     for change in ({}, {"method": "paper"}):

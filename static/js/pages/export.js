@@ -424,13 +424,21 @@ function showFiles() {
   fill(
     fileBox,
     h("header", {}, h("h2", {}, "Files"), make),
-    results.stale
-      ? note("warn", "The project has changed since these files were made; update the results on the Track page.")
-      : null,
+    staleNote(),
     reportJob.element,
     h("ul", { class: "file-rows" }, files.filter((file) => !isFigure(file)).map(fileRow)),
     figureRows(files.filter(isFigure)),
   );
+}
+
+/** What is to be done about files older than the project: once all is measured, making them needs no video. */
+function staleNote() {
+  if (!results.stale) return null;
+  const since = "The project has changed since these files were made";
+  if (isFromBefore()) return note("warn", `${since}; measure it again on the Track page.`);
+  const words = note("warn", `${since}.`);
+  words.append(h("button", { type: "button", class: "button small", onclick: makeReport }, "Update them"));
+  return words;
 }
 
 /** @param {ResultFile} file */
@@ -535,7 +543,7 @@ function onJob(job) {
   if (job.kind !== "report") return;
   reportJob.show(job);
   if (isRunning(job)) return;
-  if (job.state === "done") toast("The report is ready.", { tone: "good" });
+  if (job.state === "done") toast("Files and report are ready.", { tone: "good" });
   void reload().catch(toastError);
 }
 
