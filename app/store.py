@@ -310,7 +310,8 @@ def with_inputs(inputs: Inputs, files: dict[str, str]) -> Inputs:
     """Return inputs with some of the files replaced."""
     changes: dict[str, Any] = {kind: file for kind, file in files.items() if kind != "gps"}
     if "gps" in files:
-        changes["gps"] = (inputs.gps or GpsInput(file="")).model_copy(update={"file": files["gps"]})
+        file = files["gps"]
+        changes["gps"] = inputs.gps.model_copy(update={"file": file}) if inputs.gps else GpsInput(file=file)
     return inputs.model_copy(update=changes)
 
 

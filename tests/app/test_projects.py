@@ -224,11 +224,15 @@ def test_an_absolute_input_is_stored_relative(client: TestClient, workspace: Pat
 
 
 def test_a_project_is_made_from_files_or_from_nothing(client: TestClient, workspace: Path) -> None:
-    video = workspace / "small" / "video.mp4"
-    made = client.post("/api/projects", json={"name": "Eq 7 / über", "video": str(video)}).json()["id"]
+    files = {"video": "video.mp4", "lens": "lens.yaml", "gps": "gps.csv"}
+    named = {kind: str(workspace / "small" / file) for kind, file in files.items()}
+    made = client.post("/api/projects", json={"name": "Eq 7 / über", **named}).json()["id"]
     state = client.get(f"/api/projects/{made}").json()
     assert state["project"]["name"] == "Eq 7 / über"
-    assert state["project"]["inputs"]["video"] == "../small/video.mp4"
+    inputs = state["project"]["inputs"]
+    assert inputs | {"gps": inputs["gps"]["file"]} == {
+        "video": "../small/video.mp4", "cloud": None, "lens": "../small/lens.yaml", "gps": "../small/gps.csv"
+    }  # fmt: skip
     empty = client.post("/api/projects", json={"name": "empty"}).json()["id"]
     assert client.get(f"/api/projects/{empty}").json()["steps"]["inputs"]["status"] == "todo"
     again = client.post("/api/projects", json={"name": "empty"}).json()["id"]
