@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.coordinates import Floats, batches, finite_rows
+from core.normal_equations import solve_damped
 from core.parallel import on_all_cores
 from core.robust import TUKEY, robust_sigma
 
@@ -221,7 +222,7 @@ def _fit_batch(
             funnel = 4.0 if iteration < 2 else 1.0
             used = base * _tukey(root * residual, funnel * sigma)
         A, g = _normal(J[:, :unknowns], residual, used)
-        step = _solve_damped(A, g)
+        step = solve_damped(A, g)
         R = exponential(step[:, :3]) @ R
         if unknowns == 6:
             C = C + step[:, 3:]
@@ -240,16 +241,6 @@ def _normal(J: Floats, residual: Floats, weight: Floats) -> tuple[Floats, Floats
     weighted = (J * weight[:, None, None]).reshape(frames, unknowns, -1)
     A = weighted @ J.reshape(frames, unknowns, -1).swapaxes(1, 2)
     return A, (weighted @ residual.reshape(frames, -1, 1))[..., 0]
-
-
-def _solve_damped(A: Floats, g: Floats) -> Floats:
-    """Solve each small system after scaling; frames with too few points take no step instead of failing all."""
-    scale = np.sqrt(np.maximum(np.diagonal(A, axis1=-2, axis2=-1), 1e-300))
-    scaled = A / (scale[..., :, None] * scale[..., None, :]) + 1e-10 * np.eye(A.shape[-1])
-    usable = np.isfinite(scaled).all(axis=(-2, -1)) & (np.abs(A).max(axis=(-2, -1)) > 0)
-    scaled[~usable] = np.eye(A.shape[-1])
-    step = np.linalg.solve(scaled, (g / scale)[..., None])[..., 0] / scale
-    return np.where(usable[:, None] & np.isfinite(step), step, 0.0)
 
 
 def _sigma_seen(residual: Floats, seen: NDArray[np.bool_]) -> Floats:

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.coordinates import Bools, Floats, finite_rows
+from core.normal_equations import solve_damped
 from core.robust import biweight, finite_median, robust_sigma
 
 ITERATIONS = 8
 # Plain Gauss-Newton doubles the right digits each time; rotations are fractions of a degree.
 PLAIN_ITERATIONS = 4
-# Added to normal matrices of unit diagonal: what points do not tell stays where it was.
-RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -229,7 +228,8 @@ def rough_rigid_from_lines(points: Floats, lines: LineSet, shift: Floats, rotati
         shift, rotation_rad: predicted, where the one step begins.
 
     Returns:
-        The motion with F = 1; its normal matrix is singular where the lines do not fix it.
+        The motion with F = 1, and the residuals from before the step; its normal matrix is singular where the lines do
+        not fix it.
     """
     count, stations, _ = points.shape
     seen = finite_rows(points)[None]
@@ -333,11 +333,7 @@ def _gauss_newton(J: Floats, residual: Floats, weight: Floats) -> tuple[Floats, 
     r = np.where(w > 0, residual.reshape(frames, -1), 0.0)
     weighted = np.swapaxes(flat * w[..., None], -1, -2)
     A = weighted @ flat
-    scale = np.sqrt(np.maximum(np.diagonal(A, axis1=1, axis2=2), 1e-300))
-    scaled = A / (scale[:, :, None] * scale[:, None, :])
-    b = (weighted @ r[..., None])[..., 0] / scale
-    step = np.linalg.solve(scaled + RIDGE * np.eye(unknowns), b[..., None])[..., 0] / scale
-    return A, np.where(np.isfinite(step), step, 0.0)
+    return A, solve_damped(A, (weighted @ r[..., None])[..., 0])
 
 
 def is_determined(normal: Floats, least_ratio: float = 1e-4) -> NDArray[np.bool_]:

@@ -19,6 +19,7 @@ ORDER = (
     "progress",
     "parallel",
     "coordinates",
+    "normal_equations",
     "robust",
     "storage",
     "locks",
