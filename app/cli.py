@@ -258,7 +258,11 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
     )
     parser.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="a project folder, or a folder of them")
     parser.add_argument(
-        "--workers", type=_positive_number, default=1, metavar="N", help="measure in N processes at once (default 1)"
+        "--workers",
+        type=_positive_number,
+        default=1,
+        metavar="N",
+        help="measure in up to N processes at once (default 1): as many as cores and the clip's length repay",
     )
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="measure on the workers of this Dask scheduler (rooftrack[cluster])"

@@ -1,7 +1,7 @@
 """A clip cut into chunks of frames that can be measured anywhere, in any order.
 
-The cuts depend on the video and on how many workers there are, never on who is quick: the same command measures the
-same frames from the same beginnings.
+The cuts depend on the video, on how many workers there are and on the machine's cores, never on who is quick: the same
+command measures the same frames from the same beginnings.
 """
 
 from __future__ import annotations
@@ -22,6 +22,10 @@ WARM_UP = 8
 LEAST_FRAMES = 30
 # Frames that a process measures while those that help it are still loading.
 HEAD_START = 18
+# One process keeps two cores busy, decoding and measuring. Others that find no idle cores gain little, and repay their
+# start only by so many frames.
+CORES_EACH = 2
+REPAYING_FRAMES = 500
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,11 @@ class Chunk:
 
     start: int
     stop: int
+
+
+def processes_for(frames: int, workers: int, cores: int) -> int:
+    """Return how many of `workers` processes measure so many frames in the shortest time."""
+    return min(workers, max(1, cores // CORES_EACH, frames // REPAYING_FRAMES))
 
 
 def missing_chunks(done: Sequence[int], index: FrameIndex, parts: int, head_start: int = 0) -> list[Chunk]:

@@ -17,7 +17,7 @@ from typing import Protocol
 
 import cv2
 
-from core.chunks import HEAD_START, WARM_UP, Chunk, missing_chunks
+from core.chunks import HEAD_START, WARM_UP, Chunk, missing_chunks, processes_for
 from core.cluster import Cluster
 from core.errors import InputError
 from core.following import CONFIRM_EVERY, PointsFollower, make_follower
@@ -213,7 +213,7 @@ def measure(
     """Measure what is still missing of a video, resuming where an earlier run stopped; return the recording's number.
 
     Args:
-        workers: processes on this machine, this one among them.
+        workers: processes on this machine, this one among them; of a short clip, no more than repay their start.
         scheduler: address of a Dask scheduler whose workers measure instead.
         fresh: forget what was measured before.
 
@@ -225,17 +225,19 @@ def measure(
     recording = None if fresh else store.find(setup.method, setup.fingerprint)
     if recording is not None and store.is_finished(recording):
         return recording
+    index = frame_index(setup.video)
+    done = [] if recording is None else store.measured_frames(recording)
     with ExitStack() as stack:
-        # While timestamps and reference frame are still looked at, others load and the first chunk is being decoded.
+        # While the reference frame is still looked at, others load and the first chunk is being decoded.
         cluster = stack.enter_context(Cluster(measure_remotely, scheduler)) if scheduler is not None else None
-        is_new = recording is None and cluster is None
-        decoding = stack.enter_context(FramesAhead(setup.video, threads=min(workers - 1, 1))) if is_new else None
-        index = frame_index(setup.video)
-        done = [] if recording is None else store.measured_frames(recording)
-        chunks = missing_chunks(done, index, workers, HEAD_START) if cluster is None else []
+        processes = processes_for(len(index) - len(done), workers, available_cores())
+        chunks = missing_chunks(done, index, processes, HEAD_START) if cluster is None else []
         before = [_before(store, recording, chunk.start) for chunk in chunks]
-        helping = max(0, min(workers, len(chunks)) - 1)
+        helping = max(0, min(processes, len(chunks)) - 1)
         helpers = stack.enter_context(Helpers(measure_order, helping))
+        decoding = None
+        if recording is None and cluster is None:
+            decoding = stack.enter_context(FramesAhead(setup.video, threads=min(helping, 1), index=index))
         reference = None if recording is None else store.reference(recording)
         measurer = make_measurer(setup, reference, index, decoding)
         if recording is None:

@@ -76,14 +76,6 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class _Picture:
-    """A frame as decoded: its timestamp in stream ticks, and `luma` as of `Frame`."""
-
-    tick: int | None
-    luma: Luma
-
-
-@dataclass(frozen=True)
 class FrameIndex:
     """Where every presented frame lies: timestamps in stream ticks, ascending, and which may be decoded first."""
 
@@ -229,7 +221,7 @@ class FramesAhead:
 
     Args:
         threads: decoder threads, 0 for as many as keep all cores busy while somebody works on the frames.
-        index: of the file, where it is known already; read where it is needed and None.
+        index: of the file, where it is known already; read where None.
 
     Attributes:
         start: number of the first frame.
@@ -240,17 +232,15 @@ class FramesAhead:
     ) -> None:
         _give_pictures_back()
         self.start = start
-        self._path = path
-        # All frames may be decoded before it is known which they are.
-        self._index = index or (frame_index(path) if start > 0 or stop is not None else None)
-        self._ahead: queue.Queue[_Picture | Exception | None] = queue.Queue(maxsize=READ_AHEAD)
+        index = index or frame_index(path)
+        self._ahead: queue.Queue[Frame | Exception | None] = queue.Queue(maxsize=READ_AHEAD)
         self._seen: deque[Frame] = deque()
         self._ended = False
         self._stopped = threading.Event()
         threads = threads or min(MOST_THREADS, THREADS_PER_CORE * available_cores())
-        decoded = _decoded(path, self._index, start=start, stop=stop, threads=threads)
-        pictures = (_Picture(picture.pts, luma_of(picture)) for picture in decoded)
-        self._thread = threading.Thread(target=self._decode, args=(pictures,), name="video decoder", daemon=True)
+        decoded = _decoded(path, index, start=start, stop=stop, threads=threads)
+        frames = (Frame(number, index.time_s_of(number), luma_of(picture)) for number, picture in decoded)
+        self._thread = threading.Thread(target=self._decode, args=(frames,), name="video decoder", daemon=True)
         self._thread.start()
 
     def __enter__(self) -> FramesAhead:
@@ -285,30 +275,22 @@ class FramesAhead:
             yield frame
 
     def _next(self) -> Frame | None:
-        while (picture := self._next_picture()) is not None:
-            # Looked up here and not by the decoder, which need not wait for the index.
-            self._index = self._index or frame_index(self._path)
-            if (number := self._index.number_at(picture.tick)) is not None:
-                return Frame(number, self._index.time_s_of(number), picture.luma)
-        return None
-
-    def _next_picture(self) -> _Picture | None:
         item = None if self._ended else self._ahead.get()
         self._ended = item is None or isinstance(item, Exception)
         if isinstance(item, Exception):
             raise item
         return item
 
-    def _decode(self, pictures: Iterator[_Picture]) -> None:
+    def _decode(self, frames: Iterator[Frame]) -> None:
         try:
-            for picture in pictures:
-                if not self._hand_over(picture):
+            for frame in frames:
+                if not self._hand_over(frame):
                     return
             self._hand_over(None)
         except Exception as error:  # handed to the reading thread, which raises it
             self._hand_over(error)
 
-    def _hand_over(self, item: _Picture | Exception | None) -> bool:
+    def _hand_over(self, item: Frame | Exception | None) -> bool:
         while not self._stopped.is_set():
             try:
                 self._ahead.put(item, timeout=0.1)
@@ -359,28 +341,27 @@ def read_frames_rgb(path: File, start: int = 0, stop: int | None = None) -> Iter
         InputError: as `read_frames`.
     """
     index = frame_index(path)
-    for picture in _decoded(path, index, start=start, stop=stop, threads=available_cores()):
-        if (number := index.number_at(picture.pts)) is not None:
-            yield number, np.ascontiguousarray(np.rot90(picture.to_ndarray(format="rgb24"), picture.rotation // 90))
+    for number, picture in _decoded(path, index, start=start, stop=stop, threads=available_cores()):
+        yield number, np.ascontiguousarray(np.rot90(picture.to_ndarray(format="rgb24"), picture.rotation // 90))
 
 
 def _decoded(
-    path: File, index: FrameIndex | None, *, start: int, stop: int | None, threads: int
-) -> Iterator[VideoFrame]:
-    """Yield what can be decoded of frames `start` to `stop`, or of the whole file where there is no index."""
-    if index is not None and start >= len(index):
+    path: File, index: FrameIndex, *, start: int, stop: int | None, threads: int
+) -> Iterator[tuple[int, VideoFrame]]:
+    """Yield numbers and pictures of what can be decoded of frames `start` to `stop`."""
+    if start >= len(index):
         raise InputError(f"{path}: has {len(index)} frames, so there is no frame {start}; choose a smaller number.")
     with opened_video(path) as (container, stream):
         stream.codec_context.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
-        if index is not None and start > 0:
+        if start > 0:
             _seek(container, stream, index, start)
         for picture in decoded_pictures(container, stream):
-            number = None if index is None else index.number_at(picture.pts)
+            number = index.number_at(picture.pts)
             if number is not None and stop is not None and number >= stop:
                 return
-            if index is None or (number is not None and number >= start):
-                yield picture
+            if number is not None and number >= start:
+                yield number, picture
 
 
 def decoded_pictures(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:

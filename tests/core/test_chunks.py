@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from core.chunks import LEAST_FRAMES, WARM_UP, Chunk, missing_chunks
+from core.chunks import LEAST_FRAMES, REPAYING_FRAMES, WARM_UP, Chunk, missing_chunks, processes_for
 from core.cluster import TASK_FRAMES, tasks_for
 from core.video import FrameIndex
 
@@ -56,6 +56,22 @@ def test_few_frames_are_one_chunk():
 
 def test_nothing_is_missing_when_all_is_done():
     assert missing_chunks(list(range(40)), index_of(40, [0]), 3) == []
+
+
+@pytest.mark.parametrize(
+    ("frames", "workers", "cores", "processes"),
+    [
+        (300, 2, 2, 1),
+        (2 * REPAYING_FRAMES, 2, 2, 2),
+        (2 * REPAYING_FRAMES, 8, 2, 2),
+        (300, 2, 4, 2),
+        (300, 8, 8, 4),
+        (300, 1, 64, 1),
+        (0, 2, 1, 1),
+    ],
+)
+def test_no_process_is_started_that_does_not_repay_it(frames, workers, cores, processes):
+    assert processes_for(frames, workers, cores) == processes
 
 
 @pytest.mark.parametrize(

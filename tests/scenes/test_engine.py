@@ -20,7 +20,7 @@ import pytest
 from app import cli
 from core import measure as measuring
 from core.chunks import Chunk
-from core.errors import InputError
+from core.errors import Cancelled, InputError
 from core.lens import read_lens, write_lens
 from core.locks import take_lock
 from core.measure import make_measurer, measure_chunk
@@ -156,6 +156,13 @@ def test_the_published_way_shows_the_exact_apparent_motion(clip, tmp_path):
     assert np.sqrt(np.nanmean(error**2, axis=0)).max() < 0.2 * roof_pixel_m(BRIEF)
 
 
+@pytest.fixture
+def many_processes(monkeypatch):
+    """Have all workers measure, however short the clip and however few the cores."""
+    monkeypatch.setattr(measuring, "processes_for", lambda frames, workers, cores: workers)
+
+
+@pytest.mark.usefixtures("many_processes")
 def test_a_noisy_clip_is_compared_with_a_mean_of_frames(tmp_path_factory, tmp_path):
     brief = replace(BRIEF, texture=0.3, noise=(8.0, 0.0), recording=Recording(bit_rate=10_000_000))
     clip = rendered(tmp_path_factory, "noisy", brief)
@@ -283,11 +290,28 @@ def test_ctrl_c_keeps_what_was_measured(clip, history, tmp_path):
     assert largest_difference_m(measured_history(folder), history) < SAME_M
 
 
+@pytest.mark.usefixtures("many_processes")
 def test_two_workers_measure_the_same(clip, history, tmp_path):
     folder = project_copy(clip, tmp_path / "workers")
     assert largest_difference_m(measured_history(folder, workers=2), history) < SAME_M
 
 
+@pytest.mark.parametrize(("cores", "helping"), [(2, 0), (4, 1)])
+def test_a_short_clip_gets_help_only_where_cores_are_idle(clip, tmp_path, monkeypatch, cores, helping):
+    counts = []
+
+    def counted(work, count):
+        counts.append(count)
+        raise Cancelled
+
+    monkeypatch.setattr(measuring, "available_cores", lambda: cores)
+    monkeypatch.setattr(measuring, "Helpers", counted)
+    with pytest.raises(Cancelled):
+        measured_history(project_copy(clip, tmp_path / "short"), workers=2)
+    assert counts == [helping]
+
+
+@pytest.mark.usefixtures("many_processes")
 def test_a_chunk_may_begin_anywhere(clip, history, tmp_path, monkeypatch):
     black = np.flatnonzero((history.time_s >= BLACK_S[0]) & (history.time_s <= BLACK_S[1]))
     # In the black, right behind it, in the strongest shaking, and where no key frame is near.
@@ -353,6 +377,7 @@ def _damaged(clip, folder):
     return folder, np.setdiff1d(np.arange(ALL_FRAMES), decoded)
 
 
+@pytest.mark.usefixtures("many_processes")
 @pytest.mark.parametrize("workers", [1, 2])
 def test_damaged_frames_are_lost_and_those_behind_them_keep_their_numbers(clip, history, tmp_path, workers):
     folder, missing = _damaged(clip, tmp_path / "damaged")
