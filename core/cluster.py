@@ -71,7 +71,7 @@ class Cluster:
         from distributed import as_completed
 
         client = self._client
-        chunks = divide(tasks_for(frames, sum(client.nthreads().values())))
+        chunks = longest_first(divide(tasks_for(frames, sum(client.nthreads().values()))))
         futures = [client.submit(self._work, prepared, chunk, pure=False, retries=RETRIES) for chunk in chunks]
         try:
             # Its loop must be named: this client is nobody's default.
@@ -83,6 +83,11 @@ class Cluster:
 
 def _load(work: ChunkWork) -> None:
     """Do nothing: to receive its argument a worker imports what the work needs."""
+
+
+def longest_first(chunks: Sequence[Chunk]) -> list[Chunk]:
+    """Return the order in which chunks are given out: with short ones last, all workers are done at about one time."""
+    return sorted(chunks, key=lambda chunk: chunk.start - chunk.stop)
 
 
 def tasks_for(frames: int, workers: int) -> int:
