@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -22,13 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.coordinates import Floats, apply_homography
+from core.coordinates import Floats, apply_homography, batches
 from core.errors import InputError
 from core.following import Apparent, Scale, TargetFinder
 from core.ground import CameraFinder, fit_homography, ground_mask
 from core.lens import Lens
 from core.measurements import FrameMeasurement, Reference
 from core.motion import LineSet, fit_line, is_determined, rigid_from_lines
+from core.parallel import on_all_cores
 from core.prediction import MeasureSetup, nothing_measured, predict_apparent, predict_homography
 from core.project import LINE_NAMES, Band, Target
 from core.video import Luma
@@ -39,6 +41,8 @@ LEAST_MATCHES = 20
 # Half the side of the window SIFT looks into around an expected feature, pixels: where a descriptor's weight lies at
 # the scales kept, and what a match may lie off. Wider windows match no more features.
 WINDOW_PX = 20
+# Windows are laid out in squares of so many a side: what SIFT makes of such a picture stays near the processor.
+SIDE_BY_SIDE = 4
 LARGEST_SIZE_PX = 5.0
 # How far from its expected place a match may lie, pixels.
 NEAR_PX = 4.0
@@ -53,10 +57,23 @@ STATIONS = 500
 LEAST_STATIONS = 40
 
 
-# Places (M, 2) of features in raw pixels, their descriptors (M, 128), and the candidates for each expected feature.
-_Seen = tuple[Floats, NDArray[np.float32], list[NDArray[np.int64]]]
 # An edge along a band: its row, and the sign of the gradient across it.
 _Edge = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """M features of a frame that may be one of the reference frame's.
+
+    Attributes:
+        number: (M,) of the feature of the reference frame that each of them may be.
+        places: (M, 2) raw pixels.
+        descriptors: (M, 128).
+    """
+
+    number: NDArray[np.int64]
+    places: Floats
+    descriptors: NDArray[np.float32]
 
 
 class PaperMeasurer:
@@ -142,24 +159,19 @@ class SiftGround:
         return None if H is None or inlier.sum() < least else (H, matched)
 
     def _match(self, luma: Luma, expected_raw: Floats) -> Floats:
-        """Return each feature's match (N, 2) among those found within the window around its expected place."""
+        """Return each feature's match (N, 2): near its expected place, of the least sum of squared differences.
+
+        That must be small, and clearly less than any other's.
+        """
         windows = len(expected_raw) * (2 * WINDOW_PX) ** 2
         look = self._seen_in_windows if luma.size > 1.5 * windows else self._seen_in_all
-        places, descriptors, candidates = look(luma, expected_raw)
+        seen = look(luma, expected_raw)
+        difference = ((seen.descriptors - self._descriptors[seen.number]) ** 2).sum(axis=1)
+        best, second = _two_least(seen.number, difference)
+        clear = (difference[best] < MOST_DIFFERENCE**2) & (second > difference[best] / RATIO**2)
         matched = np.full_like(expected_raw, np.nan)
-        for number, near in enumerate(candidates):
-            best = self._best(number, descriptors[near]) if len(near) else None
-            if best is not None:
-                matched[number] = places[near[best]]
+        matched[seen.number[best[clear]]] = seen.places[best[clear]]
         return matched
-
-    def _best(self, number: int, descriptors: NDArray[np.float32]) -> int | None:
-        """Return the descriptor of least sum of squared differences from a feature's, if it is clearly the best."""
-        difference = ((descriptors - self._descriptors[number]) ** 2).sum(axis=1)
-        best = int(difference.argmin())
-        others = np.delete(difference, best)
-        clear = difference[best] < MOST_DIFFERENCE**2 and (others > difference[best] / RATIO**2).all()
-        return best if clear else None
 
     def _detect(self, picture: Luma, near: Luma) -> tuple[Floats, NDArray[np.float32]]:
         """Return the features of a picture where `near` is not zero, and their descriptors; the others get none."""
@@ -168,30 +180,44 @@ class SiftGround:
             return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
         return np.array([keypoint.pt for keypoint in keypoints]), np.asarray(descriptors, dtype=np.float32)
 
-    def _seen_in_all(self, luma: Luma, expected_raw: Floats) -> _Seen:
-        """Return what SIFT finds in the whole frame, and for each expected feature what lies near it."""
+    def _seen_in_all(self, luma: Luma, expected_raw: Floats) -> Candidates:
+        """Return what SIFT finds in the whole frame near each expected feature."""
         places, descriptors = self._detect(luma, _around(luma.shape, expected_raw))
         near: Any = cKDTree(places).query_ball_point(np.nan_to_num(expected_raw, nan=-1e6), NEAR_PX)
-        return places, descriptors, [np.array(each, dtype=np.int64) for each in near]
+        number = np.repeat(np.arange(len(near)), [len(each) for each in near])
+        found = np.fromiter(itertools.chain.from_iterable(near), dtype=np.int64)
+        return Candidates(number, places[found], descriptors[found])
 
-    def _seen_in_windows(self, luma: Luma, expected_raw: Floats) -> _Seen:
-        """Return what SIFT finds in the windows alone, laid side by side, and for each expected feature its own."""
+    def _seen_in_windows(self, luma: Luma, expected_raw: Floats) -> Candidates:
+        """Return what SIFT finds in windows around each expected feature."""
         windows, corners, index = _windows(luma, expected_raw)
         if not windows:
-            return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32), []
+            return Candidates(index, np.empty((0, 2)), np.empty((0, 128), dtype=np.float32))
+        some = list(batches(len(windows), SIDE_BY_SIDE**2))
+        seen = on_all_cores(lambda few: self._seen_in_mosaic(windows[few]), some)
+        window = np.concatenate([few.start + each.number for few, each in zip(some, seen, strict=True)])
+        number, places = index[window], np.concatenate([each.places for each in seen]) + corners[window]
+        descriptors = np.concatenate([each.descriptors for each in seen])
+        near = np.linalg.norm(places - expected_raw[number], axis=1) < NEAR_PX
+        return Candidates(number[near], places[near], descriptors[near])
+
+    def _seen_in_mosaic(self, windows: Sequence[Luma]) -> Candidates:
+        """Return what SIFT finds near the middles of windows laid side by side, by their numbers and places in them."""
         side = 2 * WINDOW_PX
-        columns = int(np.ceil(np.sqrt(len(windows))))
-        mosaic = _mosaic(windows, columns)
-        middles = np.stack(np.divmod(np.arange(len(windows)), columns)[::-1], axis=1) * side + WINDOW_PX
+        mosaic = _mosaic(windows)
+        middles = np.stack(np.divmod(np.arange(len(windows)), SIDE_BY_SIDE)[::-1], axis=1) * side + WINDOW_PX
         places, descriptors = self._detect(mosaic, _around(mosaic.shape, middles))
         tile = (places // side).astype(np.int64)
-        number = np.minimum(tile[:, 1] * columns + tile[:, 0], len(windows) - 1)
-        own = places - tile * side + corners[number]
-        # What two windows share is found in both, and is a candidate only once for each.
-        near = np.linalg.norm(own - expected_raw[index[number]], axis=1) < NEAR_PX
-        order = np.flatnonzero(near)[np.argsort(index[number[near]], kind="stable")]
-        ends = np.searchsorted(index[number[order]], np.arange(len(expected_raw) + 1))
-        return own, descriptors, [order[first:last] for first, last in itertools.pairwise(ends)]
+        return Candidates(tile[:, 1] * SIDE_BY_SIDE + tile[:, 0], places - tile * side, descriptors)
+
+
+def _two_least(number: NDArray[np.int64], value: NDArray[np.float32]) -> tuple[NDArray[np.int64], Floats]:
+    """Return, for each number there is, where its least value (K,) lies and its second-least (K,); inf where none."""
+    order = np.lexsort((value, number))
+    _, first = np.unique(number[order], return_index=True)
+    after = np.append(first[1:], len(order))
+    next_values = np.append(value[order], np.inf)[first + 1]
+    return order[first], np.where(first + 1 < after, next_values, np.inf)
 
 
 def _sift() -> cv2.SIFT:
@@ -235,12 +261,12 @@ def _windows(luma: Luma, expected_raw: Floats) -> tuple[list[Luma], Floats, NDAr
     return windows, corners[index], index
 
 
-def _mosaic(windows: list[Luma], columns: int) -> Luma:
+def _mosaic(windows: Sequence[Luma]) -> Luma:
     side = 2 * WINDOW_PX
-    rows = -(-len(windows) // columns)
-    mosaic = np.zeros((rows * side, columns * side), dtype=np.uint8)
+    rows = -(-len(windows) // SIDE_BY_SIDE)
+    mosaic = np.zeros((rows * side, SIDE_BY_SIDE * side), dtype=np.uint8)
     for number, window in enumerate(windows):
-        top, left = number // columns * side, number % columns * side
+        top, left = number // SIDE_BY_SIDE * side, number % SIDE_BY_SIDE * side
         mosaic[top : top + side, left : left + side] = window
     return mosaic
 

@@ -59,3 +59,29 @@ def test_windows_find_the_matches_that_the_whole_frame_gives(monkeypatch: pytest
     both = found & np.isfinite(in_windows).all(axis=1)
     np.testing.assert_allclose(in_windows[both], in_all[both], atol=0.1)
     np.testing.assert_allclose(np.median(in_windows[both] - ground.points_raw[both], axis=0), shift, atol=0.02)
+
+
+def test_a_feature_is_matched_only_if_it_is_clearly_the_best(monkeypatch: pytest.MonkeyPatch) -> None:
+    luma = ground_picture(2)
+    monkeypatch.setattr(paper, "FEATURES", COUNT)
+    ground = SiftGround(luma, scene.LENS, np.ones(luma.shape, dtype=bool))
+    own = ground._descriptors
+    off = np.zeros_like(own)
+    off[:, 0] = 100.0
+    beside = np.array([0.5, 0.0])
+    number = np.array([3, 0, 1, 1, 2, 2])
+    # Alone; alone, but too different; clearly the better of two; one of two that are much alike.
+    descriptors = own[number] + off[number] * np.array([1.0, 2.6, 1.3, 1.0, 0.9, 1.0])[:, None]
+    descriptors[2] += off[1]
+    seen = paper.Candidates(number, ground.points_raw[number] + beside, descriptors)
+    monkeypatch.setattr(SiftGround, "_seen_in_windows", lambda *_: seen)
+    matched = ground._match(luma, ground.points_raw)
+    np.testing.assert_array_equal(np.flatnonzero(np.isfinite(matched[:, 0])), [1, 3])
+    np.testing.assert_allclose(matched[[1, 3]], ground.points_raw[[1, 3]] + beside)
+
+
+def test_nothing_is_matched_where_all_windows_leave_the_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    luma = ground_picture(2)
+    monkeypatch.setattr(paper, "FEATURES", COUNT)
+    ground = SiftGround(luma, scene.LENS, np.ones(luma.shape, dtype=bool))
+    assert not np.isfinite(ground._match(luma, ground.points_raw + 5000.0)).any()
