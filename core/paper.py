@@ -33,6 +33,7 @@ from core.motion import LineSet, fit_line, is_determined, rigid_from_lines
 from core.parallel import on_all_cores
 from core.prediction import MeasureSetup, nothing_measured, predict_apparent, predict_homography
 from core.project import LINE_NAMES, Band, Target
+from core.roof_level import kind_obstacle, refuse_if
 from core.video import Luma
 
 # Matches per frame of the paper: 300-500.
@@ -339,11 +340,8 @@ class CannyLines:
 
 
 def _lines_target(luma: Luma, target: Target, setup: MeasureSetup) -> CannyLines:
-    if target.lines is None or target.kind != "lines":
-        raise InputError(
-            f'project.json: targets.{target.name} is of kind "points", which method "paper" does not know; '
-            'choose "geometric", or mark lines.'
-        )
+    refuse_if(kind_obstacle(target), target)
+    assert target.lines is not None
     return CannyLines(luma, [getattr(target.lines, name) for name in LINE_NAMES], setup, target.name)
 
 

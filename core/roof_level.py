@@ -24,6 +24,13 @@ def height_obstacle(target: Target, camera: Pose | None) -> str | None:
     return _too_high(target.height_m, camera)
 
 
+def kind_obstacle(target: Target) -> str | None:
+    """Return what keeps `paper` from following a target, or None."""
+    if target.kind == "points":
+        return 'kind: "points", which method "paper" does not know; choose "geometric", or mark lines'
+    return None
+
+
 def scale_obstacle(target: Target, camera: Pose | None, *, has_lens: bool) -> str | None:
     """Return what keeps `paper` from knowing a target's scale, or None.
 
@@ -31,8 +38,8 @@ def scale_obstacle(target: Target, camera: Pose | None, *, has_lens: bool) -> st
         camera: as in `height_obstacle`.
         has_lens: whether there is a lens, without which the clicks tell no camera.
     """
-    if target.kind == "points":
-        return 'kind: "points", which method "paper" does not know; choose "geometric", or mark lines'
+    if (obstacle := kind_obstacle(target)) is not None:
+        return obstacle
     if target.p1_p2_m is None and (target.height_m is None or not has_lens):
         return (
             'p1_p2_m: missing; "paper" takes its scale from the known distance P1-P2, or from height_m and a lens; '
