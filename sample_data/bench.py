@@ -31,7 +31,7 @@ import av
 import cv2
 import numpy as np
 
-from core.chunks import WARM_UP, Chunk
+from core.chunks import WARM_UP, Chunk, processes_for
 from core.following import LinesFollower
 from core.ground import GroundTracker
 from core.measure import PreparedVideo, make_measurer, measure, measure_chunk, measure_order
@@ -500,6 +500,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(table(results[-1:], chosen.frames, chosen.long_factor), flush=True)
     text = table(results, chosen.frames, chosen.long_factor)
     text += f"\n\nMedians of {chosen.runs}, {os.cpu_count()} cores; rewritten by `make bench BENCH_OPTIONS=--write`."
+    if processes_for(chosen.frames, 2, available_cores()) == 1:
+        text += f" With two workers, {chosen.frames} frames are measured by one process here: a second would not repay."
     print(text)
     if chosen.write:
         write_between_markers(README, "bench", f"\n{text}\n")
