@@ -1,16 +1,16 @@
 // Review: look at every frame as the engine saw it, beside the motion it made of it.
 
-import { get, projectPath } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { count, fixed, plural } from "../lib/format.js";
 import { setView, viewNumber, viewText } from "../lib/view-state.js";
 import { busyOver } from "../components/busy.js";
+import { earlierNote } from "../components/earlier-note.js";
 import { ExclusionEditor } from "../components/exclusions.js";
 import { FrameLibrary } from "../components/frames.js";
 import { FrameView } from "../components/frame-view.js";
 import { AXES, fetchHistory, fetchResults, methodName, METHODS, worstStatuses } from "../components/histories.js";
 import { stepUrl } from "../components/header.js";
-import { whenMeasured } from "../components/measured.js";
+import { whenMeasured, whenVideo } from "../components/measured.js";
 import { openPage } from "../components/page.js";
 import { paneKeys } from "../components/pane-keys.js";
 import { Player } from "../components/player.js";
@@ -42,7 +42,7 @@ let results = await whenMeasured(
   page,
   "Track the video first; every frame can then be looked at here, with what was measured on it.",
 );
-const { video } = await get(projectPath(page.id, "inputs"));
+const video = await whenVideo(page, "Its frames are looked at here, with what was measured on each.");
 
 // what is looked at
 const has = (/** @type {string | null} */ name) => results.methods.find((method) => method === name);
@@ -82,6 +82,7 @@ const compareSwitch = h("input", {
 });
 const compareLabel = h("label", { class: "switch small" }, compareSwitch, "Compare methods");
 const solving = h("span", { class: "badge accent", role: "status", hidden: true }, "Solving again…");
+const earlier = earlierNote(page);
 const facts = h("section", { class: "section", "aria-label": "This frame" });
 const doubtful = h("section", { class: "section", "aria-label": "Weak and lost frames" });
 const excluded = h("section", { class: "section", "aria-label": "Excluded frames" });
@@ -104,6 +105,7 @@ fill(
       compareLabel,
       methodChoice.element,
     ),
+    earlier.element,
     stageBody,
     transport,
     plotArea,
@@ -120,11 +122,11 @@ const player = new Player(transport);
 const plots = AXES.map(
   (axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "review", drag: "seek", leastSpan: 0.002 }),
 );
-const solver = new Solver(
-  page,
-  () => results.ready && !results.stale,
-  (busy) => (solving.hidden = !busy),
-);
+const solver = new Solver(page, {
+  isFresh: () => results.ready && !results.stale,
+  onBusy: (busy) => (solving.hidden = !busy),
+  reload: refresh,
+});
 const exclusions = new ExclusionEditor(excluded, {
   store,
   solver,
@@ -136,10 +138,11 @@ listen();
 page.keys(keys());
 showLayers();
 view.setLayers(layers);
+exclusions.show();
+chooseStage(stage);
 const opened = busyOver(stageBody, "Solving…");
 await loadHistories().catch(toastError);
 opened();
-chooseStage(stage);
 player.go(viewNumber("frame", store.project.reference_frame));
 
 function listen() {
@@ -152,6 +155,7 @@ function listen() {
     plot.on("interval", ({ from, to }) => exclusions.select(from, to));
   }
   page.events.on("results", () => void refresh().catch(toastError));
+  page.events.on("online", () => void refresh().catch(toastError));
   store.on("change", () => exclusions.show());
 }
 
@@ -243,6 +247,7 @@ async function loadHistories() {
     worstStatuses(results.targets.map((name) => histories.get(`${method}/${name}`)?.status ?? [])),
   );
   exclusions.setFrames(main.time_s);
+  earlier.show(results, { method, isEarlier: main.is_earlier });
   drawPlots(main);
   showDoubtful();
   showFacts();
@@ -463,7 +468,11 @@ function showFacts() {
       h(
         "dd",
         {},
-        ground ? `${plural(ground.used.length, "feature")} used, ${count(ground.rejected.length)} rejected` : "…",
+        ground
+          ? `${plural(ground.used.length, "feature")} used, ${count(ground.rejected.length)} rejected`
+          : view.isShown(i)
+            ? "–"
+            : "…",
       ),
     ),
   );
