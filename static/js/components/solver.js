@@ -41,8 +41,9 @@ export class Solver {
    */
   async edit(label, change, options = {}) {
     const wanted = this.isFresh() || this.#busy;
+    const { revision } = this.page.store;
     await this.page.store.edit(label, change, options);
-    if (wanted) await this.#solve();
+    if (wanted && this.page.store.revision !== revision) await this.#solve(); // else it was not saved
   }
 
   /** @param {import("../lib/store.js").StoreEvents["change"]} change */
