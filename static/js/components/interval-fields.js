@@ -61,7 +61,7 @@ export function intervalFields(host, onChange, end_s) {
     );
     return { name, from, to, element };
   });
-  const words = h("div", { class: "warnings", role: "status" });
+  const words = h("div", { class: "interval-words", role: "status" });
   fill(
     host,
     h(
