@@ -367,7 +367,7 @@ def _calibration(content: ReportContent) -> str:
     ]
     names = {correction.name for correction in content.corrections}
     legend = ", ".join(words for name, words in _LENS_WORDS.items() if name in names)
-    words = f"<p>{escape(legend[:1].upper() + legend[1:])}.</p>" if legend else ""
+    words = f"<p>{escape(legend)}.</p>" if legend else ""
     return note + _table(["parameter", "before", "after ± 1 σ", "change, in σ of what was given"], rows) + words
 
 
@@ -441,7 +441,7 @@ _STYLE = """
   @bottom-left { content: "Rooftrack, displacement report"; font: 8pt sans-serif; color: #555; }
   @bottom-right { content: "page " counter(page) " of " counter(pages); font: 8pt sans-serif; color: #555; } }
 body { font: 10pt/1.45 "Segoe UI", "Helvetica Neue", Arial, "DejaVu Sans", sans-serif; color: #1a1a1a; background: #fff;
-  max-width: 178mm; margin: 12mm auto; padding: 0 6mm; }
+  max-width: 178mm; margin: 12mm auto; padding: 0 6mm; counter-reset: figure; }
 .kind { font-size: 10pt; color: #555; margin: 0; }
 h1 { font-size: 20pt; margin: 0 0 1mm; }
 h2 { font-size: 13pt; margin: 9mm 0 2mm; border-bottom: 0.3mm solid #bbb; padding-bottom: 1mm; break-after: avoid; }
