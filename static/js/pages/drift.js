@@ -396,11 +396,13 @@ function drawHistory() {
   ];
   const columns = [answer.raw[key], answer.filtered[key]];
   if (geometric) {
-    traces.push({ label: "Geometric", colour: "--series-2", width: 1.6 });
+    const label = geometric.is_earlier ? "Geometric, before the change" : "Geometric";
+    traces.push({ label, colour: "--series-2", width: 1.6 });
     columns.push(geometric[column]);
-    history.setStatuses(geometric.status);
   }
-  if (history.traces.length === traces.length) history.setData([answer.time_s, ...columns]);
+  history.setStatuses(answer.status);
+  const names = (/** @type {{label: string}[]} */ of) => of.map(({ label }) => label).join();
+  if (names(history.traces) === names(traces)) history.setData([answer.time_s, ...columns]);
   else history.setTraces(traces, [answer.time_s, ...columns]);
 }
 

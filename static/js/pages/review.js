@@ -278,7 +278,8 @@ function drawPlots(main) {
     ];
     const columns = [main[`p1_${axis}_m`], main[`p2_${axis}_m`]];
     if (beside) {
-      traces.push({ label: `P1 ${methodName(other).toLowerCase()}`, colour: "--series-4", dash: [3, 3] });
+      const label = `P1 ${methodName(other).toLowerCase()}${beside.is_earlier ? ", before the change" : ""}`;
+      traces.push({ label, colour: "--series-4", dash: [3, 3] });
       columns.push(beside[`p1_${axis}_m`]);
     }
     plot.setTraces(traces, [main.time_s, ...columns]);
