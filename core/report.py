@@ -163,10 +163,15 @@ def _how_to_read(project: Project) -> str:
     rest = "the reference frame"
     if project.method == "geometric" and at_rest is not None:
         rest = f"the mean position from {at_rest[0]:g} to {at_rest[1]:g} s, before the event"
+    kinds = {target.kind for target in project.targets}
+    points = "P1, where the lines L1 and T1 cross, and P2, where L2 and T1 cross"
+    if kinds == {"points"}:
+        points = "P1 and P2, two points of the target's region"
+    elif "points" in kinds:
+        points += " (of a target without lines, two points of its region)"
     text = (
-        "Displacement of P1, where the lines L1 and T1 cross, and P2, where L2 and T1 cross, at roof level, along x "
-        f"(east) and y (north) of the point cloud. It is counted from {rest}. Drift ratio is the residual "
-        "over the height of the target."
+        f"Displacement of {points}, at the height of the target, along x (east) and y (north) of the point cloud. It "
+        f"is counted from {rest}. Drift ratio is the residual over the height of the target."
     )
     return f"<p>{escape(text)}</p>"
 

@@ -222,6 +222,15 @@ def test_paper_method_with_filter_says_what_it_cannot() -> None:
     assert "No pre-event interval was given" in html
 
 
+def test_what_p1_and_p2_are_is_said_of_each_kind_of_target() -> None:
+    points = parse_project(
+        """{"name": "EQ7", "inputs": {"video": "v.mp4"}, "targets": [{"name": "roof", "kind": "points",
+        "height_m": 9.0, "region_m": [[0, 0], [5, 0], [5, 5]]}]}"""
+    )
+    assert "two points of the target&#x27;s region" in report_html(content(project=points, targets=[]))
+    assert "where the lines L1 and T1 cross" in report_html(content())
+
+
 def test_relative_targets_have_no_drift_ratio() -> None:
     roof = project().targets[0]
     both = (roof.model_copy(update={"relative_to": "table"}), roof.model_copy(update={"name": "table"}))

@@ -347,6 +347,7 @@ function chooseStage(wanted) {
   setView({ view: wanted === "frame" ? null : wanted });
   scene.setActive(wanted !== "frame", player.frame);
   view.setActive(wanted !== "scene");
+  showFacts();
 }
 
 function nextStage() {
@@ -427,7 +428,6 @@ function showFacts() {
   const i = player.frame;
   const status = main.status[i] ?? "ok";
   const turn = main.rotation_rad[i];
-  const ground = view.review?.frame === i ? view.review.ground : null;
   const row = (/** @type {"p1" | "p2"} */ point) =>
     h(
       "tr",
@@ -465,18 +465,16 @@ function showFacts() {
       h("dd", {}, `${fixed(main.time_s[i], 3)} s`),
       h("dt", {}, "Rotation"),
       h("dd", {}, turn === null || turn === undefined ? "–" : `${fixed(turn * 1000, 2)} mrad`),
-      h("dt", {}, "Ground"),
-      h(
-        "dd",
-        {},
-        ground
-          ? `${plural(ground.used.length, "feature")} used, ${count(ground.rejected.length)} rejected`
-          : view.isShown(i)
-            ? "–"
-            : "…",
-      ),
+      stage === "scene" ? null : [h("dt", {}, "Ground"), h("dd", {}, groundWords(i))],
     ),
   );
+}
+
+/** What is known of the ground in a frame: known only where the frame is looked at. @param {number} frame */
+function groundWords(frame) {
+  const ground = view.review?.frame === frame ? view.review.ground : null;
+  if (ground) return `${plural(ground.used.length, "feature")} used, ${count(ground.rejected.length)} rejected`;
+  return view.isShown(frame) ? "–" : "…";
 }
 
 /** @param {History} history @param {number} i @param {"p1" | "p2"} point @param {"dx" | "dy"} axis */
