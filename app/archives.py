@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import lzma
 import os
+import posixpath
 import shutil
 import stat
 import time
@@ -18,6 +19,7 @@ from app.history import DAMAGED_FILE, HISTORY_FILE
 from app.jobs import JOB_FILE
 from app.store import CACHE_FOLDER, ProjectFolder, Workspace, stored_inputs, with_inputs
 from app.uploads import SPARE_BYTES
+from core.errors import InputError
 from core.project import PROJECT_FILE, RESULTS_FOLDER, Project, parse_project, project_json, write_project
 
 INPUTS_FOLDER = "inputs"
@@ -29,6 +31,8 @@ _PACKED_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".laz", ".jpg", ".jpeg", ".p
 _MAX_FILES = 20_000
 _MAX_RATIO = 100
 _FREE_BYTES = 64 << 20
+# What systems put beside the files of a folder that a person packs.
+_OF_SYSTEMS = ("__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini")
 # What reading a damaged zip raises, wherever the damage is: its directory, a header, or what was packed.
 _DAMAGE = (
     zipfile.BadZipFile,
@@ -130,8 +134,8 @@ def restore(workspace: Workspace, archive_file: Path, name: str | None) -> Proje
     """Unpack an archive as a new project of the workspace; an archive that is refused leaves nothing behind.
 
     Raises:
-        Invalid: no zip, no project in it, a name that leads outside, a link, or far more content than its size.
-        InputError: its `project.json` cannot be used.
+        Invalid: no zip, no project in it or one that cannot be used, a name that leads outside, a link, or far more
+            content than its size.
     """
     folder = archive_file.with_name(f"{archive_file.name}.folder")
     try:
@@ -140,7 +144,7 @@ def restore(workspace: Workspace, archive_file: Path, name: str | None) -> Proje
             folder.mkdir()
             for entry, target in entries.items():
                 _unpack(archive, entry, folder / target)
-        project = parse_project((folder / PROJECT_FILE).read_text(encoding="utf-8"), PROJECT_FILE)
+        project = _project_in(folder)
         if name:
             project = project.model_copy(update={"name": name})
         write_project(folder, project)
@@ -153,9 +157,17 @@ def restore(workspace: Workspace, archive_file: Path, name: str | None) -> Proje
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def _project_in(folder: Path) -> Project:
+    try:
+        return parse_project((folder / PROJECT_FILE).read_text(encoding="utf-8"), PROJECT_FILE)
+    except InputError as error:
+        reason = str(error).removeprefix(f"{PROJECT_FILE}: ")
+        raise Invalid(f"The {PROJECT_FILE} in the archive cannot be used: {reason}") from None
+
+
 def _trusted_entries(archive: zipfile.ZipFile, archive_file: Path) -> dict[zipfile.ZipInfo, PurePosixPath]:
     """Return the files of an archive and where each goes, relative to the project folder."""
-    files = [entry for entry in archive.infolist() if not entry.is_dir()]
+    files = [entry for entry in archive.infolist() if not entry.is_dir() and not _is_of_a_system(entry)]
     if len(files) > _MAX_FILES:
         raise Invalid(f"The archive holds {len(files)} files, which no project has; choose one made by Rooftrack.")
     packed_bytes = archive_file.stat().st_size
@@ -166,7 +178,7 @@ def _trusted_entries(archive: zipfile.ZipFile, archive_file: Path) -> dict[zipfi
         raise Invalid(f"The archive needs {total_bytes / 1e9:.1f} GB, more than the disk has free; make room.")
     places = {entry: _safe_place(entry) for entry in files}
     top = _top_folder(places.values())
-    inner = {entry: place.relative_to(top) if top else place for entry, place in places.items()}
+    inner = {entry: place.relative_to(top) for entry, place in places.items()}
     if PurePosixPath(PROJECT_FILE) not in inner.values():
         raise Invalid(f"The archive holds no {PROJECT_FILE}; choose one made by Rooftrack.")
     return {entry: place for entry, place in inner.items() if not _is_servers_own(place)}
@@ -188,10 +200,15 @@ def _safe_place(entry: zipfile.ZipInfo) -> PurePosixPath:
     return place
 
 
-def _top_folder(places: Iterable[PurePosixPath]) -> PurePosixPath | None:
-    """Return the one folder everything lies in, as when a person packed the folder itself; None without one."""
-    found = {place.parts[0] if len(place.parts) > 1 else "" for place in places}
-    return PurePosixPath(found.pop()) if len(found) == 1 and "" not in found else None
+def _is_of_a_system(entry: zipfile.ZipInfo) -> bool:
+    parts = entry.filename.replace("\\", "/").split("/")
+    return parts[0] in _OF_SYSTEMS or parts[-1] in _OF_SYSTEMS
+
+
+def _top_folder(places: Iterable[PurePosixPath]) -> PurePosixPath:
+    """Return the folder everything lies in, as when a person packed the project's folder itself, or one around it."""
+    folders = [place.parent.as_posix() for place in places]
+    return PurePosixPath(posixpath.commonpath(folders) if folders else ".")
 
 
 def _unpack(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -11,6 +13,9 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from core.errors import Cancelled, InputError
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
 
 
 class ApiError(Exception):
@@ -100,6 +105,17 @@ def install_error_handlers(app: FastAPI) -> None:
         kind = kinds.get(error.status_code, "input" if error.status_code < 500 else "internal")
         message = f"{request.url.path}: {str(error.detail).lower()}."
         return JSONResponse(error_body(message, kind=kind), status_code=error.status_code, headers=error.headers)
+
+    @app.exception_handler(OSError)
+    def _disk(request: Request, error: OSError) -> JSONResponse:
+        if error.errno in _FULL:
+            words = "The disk is full, so nothing was written; make room, then do it again."
+        elif error.errno in _FORBIDDEN:
+            name = Path(str(error.filename or "the project's folder")).name
+            words = f"The computer does not allow writing to {name}, or reading it; allow it, then do it again."
+        else:
+            raise error
+        return JSONResponse(error_body(words, kind="disk"), status_code=507)
 
     @app.exception_handler(Exception)
     def _unexpected(request: Request, error: Exception) -> JSONResponse:

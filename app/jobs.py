@@ -144,8 +144,9 @@ class Jobs:
             try:
                 self._launch(project, job, finish)
             except (OSError, RuntimeError) as error:
+                reason = getattr(error, "strerror", error)
                 raise InputError(
-                    f"{_spoken(kind)} could not be started ({error}); make room on the disk and in memory, try again."
+                    f"{_spoken(kind)} could not be started ({reason}); make room on the disk and in memory, try again."
                 ) from None
             self._forget_oldest()
         self._tell(job)

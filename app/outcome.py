@@ -79,6 +79,14 @@ class Solved:
     solution: Solution
 
 
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A target's displacement to look at, and whether it is only that of an earlier state of the project."""
+
+    history: TargetHistory
+    is_earlier: bool = False
+
+
 def state_of(folder: ProjectFolder, project: Project) -> Outcome:
     """Return the state of a project's results, from the facts on the disk."""
     summary = read_json(folder.results / SUMMARY_FILE)
@@ -238,6 +246,14 @@ class Outcomes:
     def history(
         self, folder: ProjectFolder, project: Project, target: str, method: Method | None = None
     ) -> TargetHistory:
+        """Return a target's displacement, of the project as it stands or, failing that, as the last run wrote it.
+
+        Raises:
+            NotYet: there is neither.
+        """
+        return self.shown(folder, project, target, method).history
+
+    def shown(self, folder: ProjectFolder, project: Project, target: str, method: Method | None = None) -> Shown:
         """Return a target's displacement: as the last run wrote it where that still holds, else solved now.
 
         Where the project cannot be solved as it stands, what the last run wrote is better than nothing.
@@ -251,16 +267,16 @@ class Outcomes:
         summary = state.summary or {}
         written = target in summary.get("targets", {}) and summary.get("method") == chosen and file.is_file()
         if written and not state.stale:
-            return _written(fingerprint(file))
+            return Shown(_written(fingerprint(file)))
         if recorded_of(folder, project, chosen).finished:
             try:
                 solution = self.solved(folder, project, chosen).solution
             except InputError:
                 solution = None
             if solution is not None and target in solution.histories:
-                return solution.histories[target]
+                return Shown(solution.histories[target])
         if written:
-            return _written(fingerprint(file))
+            return Shown(_written(fingerprint(file)), is_earlier=True)
         raise NotYet(f"{target}: not measured by the {chosen} method yet; track first.", path="track")
 
     def gps(self, folder: ProjectFolder, project: Project, drift: Drift) -> GpsCheck | None:

@@ -43,6 +43,27 @@ def lens_of(folder: ProjectFolder, project: Project) -> tuple[Lens, bool]:
     return lens, True
 
 
+def outside_frame(folder: ProjectFolder, project: Project, pairs: Sequence[Correspondence]) -> str:
+    """Return which of the pairs that count lie beside the picture, and what to do; empty where none does.
+
+    Raises:
+        ApiError, InputError: the video or the lens cannot be used.
+    """
+    width, height = lens_of(folder, project)[0].image_size_px
+    beside = [str(pair.id) for pair in pairs if pair.enabled and not _is_in_frame(pair.frame_px, width, height)]
+    if not beside:
+        return ""
+    frame = f"the {width} × {height} frame"
+    if len(beside) == 1:
+        return f"Pair {beside[0]} lies outside {frame}; move it, or switch it off."
+    return f"Pairs {', '.join(beside)} lie outside {frame}; move them, or switch them off."
+
+
+def _is_in_frame(place_px: tuple[float, float], width: int, height: int) -> bool:
+    u, v = place_px
+    return -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5
+
+
 @lru_cache(maxsize=32)
 def _lens(key: Fingerprint) -> Lens:
     return read_lens(Path(key[0]))

@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from urllib.parse import quote
 
 import uvicorn
 from fastapi import FastAPI, Request
@@ -154,7 +155,7 @@ def _add_pages(app: FastAPI) -> None:
             step = next((name for name in STEPS if steps[name]["status"] not in SETTLED), STEPS[-1])
         except (InputError, Missing):
             step = STEPS[0]
-        return RedirectResponse(f"/p/{project_id}/{step}")
+        return RedirectResponse(f"/p/{quote(project_id, safe='')}/{step}")
 
     @app.get("/p/{project_id}/{step}")
     def page(project_id: str, step: str, here: Here, request: Request) -> FileResponse:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from app import orthoimages, outcome
 from app.errors import ApiError
 from app.frames import Fingerprint, fingerprint
-from app.reference import lens_of, reference_fit
+from app.reference import lens_of, outside_frame, reference_fit
 from app.store import ProjectFolder, problem_of, stored_inputs
 from app.videos import is_read_through, video_info
 from core.check import check_project
@@ -113,7 +113,7 @@ def _inputs(seen: _Look) -> Step:
             (given if seen.folder.is_there(kind, seen.project) else missing).append(kind)
         except ApiError as error:
             return _step("error", error.message)
-    if "video" in missing:
+    if seen.folder.named_input("video", seen.project) is None:
         return _step("todo", "Choose the video, or send it.")
     if missing:
         return _step("error", f"Not found: {', '.join(missing)}; choose it again.")
@@ -180,6 +180,8 @@ def _correspondences(seen: _Look) -> Step:
     if enabled < 4:
         return _step("todo", f"{enabled} pairs of at least 4, better 20.")
     try:
+        if beside := outside_frame(seen.folder, seen.project, seen.project.correspondences):
+            return _step("error", beside)
         fit = reference_fit(seen.here, seen.folder, seen.project)
     except (InputError, ApiError) as error:
         return _step("error", problem_of(error))

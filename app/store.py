@@ -9,6 +9,7 @@ import secrets
 import shutil
 import threading
 import time
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -42,7 +43,11 @@ CHECKERBOARD_FOLDER = "checkerboard"
 VIDEO_TO_COME = "video.mp4"
 INPUT_KINDS = ("video", "cloud", "lens", "gps")
 _RESERVED = {PROJECT_FILE, HISTORY_FILE, RESULTS_FOLDER, CHECKERBOARD_FOLDER}
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,79}")
+# A folder a person named may be called anything that is hidden nowhere and leads nowhere.
+_ID = re.compile(r'(?!\.)[^\x00-\x1f\x7f/\\:*?"<>|]{1,255}')
+# Windows gives these names to devices, whatever ending follows.
+_DEVICE = re.compile(r"(?:con|prn|aux|nul|(?:com|lpt)[0-9])(?:\..*)?", re.IGNORECASE)
+_NAME_LENGTH = 60
 _PART_PREFIX = ".incoming-"
 _TRASH_KEPT_S = 31 * 86_400.0
 
@@ -142,10 +147,12 @@ class ProjectFolder:
     def named_input(self, kind: str, project: Project) -> str | None:
         """Return what a project names as an input, where a person named it; None where none is given.
 
-        A project needs the name of a video from the beginning, so one made without carries a name nobody chose.
+        A project needs the name of a video from the beginning, so one made without carries a name nobody chose. Where
+        somebody has clicked in its frames, there was a video of that name.
         """
         stored = stored_inputs(project.inputs)[kind]
-        to_come = kind == "video" and stored == VIDEO_TO_COME and not (self.folder / stored).exists()
+        clicked = project.correspondences or project.moving_regions_px
+        to_come = kind == "video" and stored == VIDEO_TO_COME and not clicked and not (self.folder / stored).exists()
         return None if to_come else stored
 
     def input_path(self, kind: str, project: Project | None = None) -> Path | None:
@@ -273,6 +280,20 @@ class ProjectFolder:
     def _store(self, project: Project, *, label: str, merge: bool = False) -> Saved:
         write_project(self.folder, project)
         return Saved(project, self._history.record(label, project_json(project), merge=merge))
+
+
+def folder_name(name: str) -> str:
+    """Return a folder's name for a project, the same on every system: letters and digits of any script are kept.
+
+    Raises:
+        Invalid: there is none in the name.
+    """
+    composed = unicodedata.normalize("NFC", name)
+    kept = "".join(sign if sign in " ._-" or unicodedata.category(sign)[0] in "LMN" else "\n" for sign in composed)
+    plain = re.sub(r"\n+", "-", kept).strip(" ._-")[:_NAME_LENGTH].rstrip(" ._-")
+    if not plain:
+        raise Invalid("A project needs a name with a letter or a digit in it; give one.", path="name")
+    return f"project {plain}" if _DEVICE.fullmatch(plain) else plain
 
 
 def plain_name(wanted: str) -> str:
@@ -436,9 +457,7 @@ class Workspace:
             raise
 
     def _free_id(self, name: str) -> str:
-        plain = re.sub(r"[^A-Za-z0-9 ._-]+", "-", name.strip()).strip(" ._-")[:60]
-        if not plain:
-            raise Invalid("A project needs a name with a letter or a digit in it; give one.", path="name")
+        plain = folder_name(name)
         number, candidate = 1, plain
         while (self.folder / candidate).exists():
             number += 1

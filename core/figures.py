@@ -341,7 +341,8 @@ def gps_figure(
         _legend(error)
         for panel in (over, error):
             _shade(panel, intervals or Intervals(), named=panel is panels[0])
-    panels[0].set_title(f"Video and GPS (clock lag {comparison.lag_s:.3f} s)")
+    lag = f"{comparison.lag_s:.3f} s".replace("-", "\N{MINUS SIGN}")
+    panels[0].set_title(f"Video and GPS (clock lag {lag})")
     _legend(panels[0])
     panels[3].set_xlabel("time, s")
     return figure

@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import date
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,11 @@ from core.storage import write_atomically
 from core.validation import GpsComparison
 
 REPORT_FILE = "report.html"
+_LENS_WORDS = {
+    "fx": "fx and fy are the focal length",
+    "cx": "cx and cy the principal point",
+    "k1": "k1 … the distortion",
+}
 
 
 @dataclass(frozen=True)
@@ -116,15 +122,17 @@ class ReportContent:
 def write_report(folder: Path, content: ReportContent) -> Path:
     """Write `report.html` into a folder, atomically; return its path."""
     path = folder / REPORT_FILE
-    write_atomically(path, report_html(content).encode())
+    write_atomically(path, report_html(content, date.today()).encode())
     return path
 
 
-def report_html(content: ReportContent) -> str:
-    """Return the report as one self-contained HTML document."""
+def report_html(content: ReportContent, made_on: date | None = None) -> str:
+    """Return the report as one self-contained HTML document, with the day it was made on where that is given."""
     sections = [
         _section("Warnings", _list(content.warnings)) if content.warnings else "",
-        _section("Results", *(_target(content.project, target) for target in content.targets)),
+        _section(
+            "Results", _how_to_read(content.project), *(_target(content.project, target) for target in content.targets)
+        ),
         _section("Inputs", _inputs(content)),
         _section("Method", _method(content.project), _settings(content.project)),
         _section("Reference frame", _reference_fit(content.reference_fit)),
@@ -133,17 +141,39 @@ def report_html(content: ReportContent) -> str:
         _section("Camera", *map(_figure, content.figures)) if content.figures else "",
         _section("Limitations", _list(_limitations(content.project))),
     ]
-    return _PAGE.format(title=escape(content.project.name), style=_STYLE, head=_head(content), body="".join(sections))
+    return _PAGE.format(
+        title=escape(content.project.name), style=_STYLE, head=_head(content, made_on), body="".join(sections)
+    )
 
 
-def _head(content: ReportContent) -> str:
+def _head(content: ReportContent, made_on: date | None) -> str:
     pace = (
         ""
         if not content.seconds
         else f" in {content.seconds:.1f} s ({content.frames / content.seconds:.1f} per second)"
     )
     method = "geometric method" if content.project.method == "geometric" else "published method"
-    return f"<p>{escape(f'{content.frames} frames{pace}, {method}. Rooftrack {content.version}.')}</p>"
+    day = "" if made_on is None else f" Made on {made_on.isoformat()}."
+    return f"<p>{escape(f'{content.frames} frames{pace}, {method}. Rooftrack {content.version}.{day}')}</p>"
+
+
+def _how_to_read(project: Project) -> str:
+    """Return what the numbers are: of which points, along which axes, from where they are counted."""
+    at_rest = project.intervals_s.pre_event
+    rest = "the reference frame"
+    if project.method == "geometric" and at_rest is not None:
+        rest = f"the mean position from {at_rest[0]:g} to {at_rest[1]:g} s, before the event"
+    kinds = {target.kind for target in project.targets}
+    points = "P1, where the lines L1 and T1 cross, and P2, where L2 and T1 cross"
+    if kinds == {"points"}:
+        points = "P1 and P2, two points of the target's region"
+    elif "points" in kinds:
+        points += " (of a target without lines, two points of its region)"
+    text = (
+        f"Displacement of {points}, at the height of the target, along x (east) and y (north) of the point cloud. It "
+        f"is counted from {rest}. Drift ratio is the residual over the height of the target."
+    )
+    return f"<p>{escape(text)}</p>"
 
 
 def _target(project: Project, target: TargetReport) -> str:
@@ -221,16 +251,23 @@ def _gps_table(gps: GpsComparison) -> str:
         ]
         for row in gps.table()
     ]
-    lag = _signed(f"{gps.lag_s:+z.4f} s") + ("" if gps.lag_sigma_s is None else f" (± {gps.lag_sigma_s:.4f} s)")
     rms_x, rms_y = gps.rms_m
     text = (
         f"RMS difference {1000 * rms_x:.2f} mm in x and {1000 * rms_y:.2f} mm in y over {len(gps.time_s)} samples; "
-        f"GPS time {lag} is video time. {gps.spacing} {gps.message}"
+        f"{_lag_words(gps)} {gps.spacing} {gps.message}"
     )
     header = ["", "video, cm", "GPS, cm", "error, cm", "error, %"]
     if gps.is_coarse:
         header += ["video at the GPS instant, cm", "error there, cm"]
     return f"<h4>Comparison with GPS</h4><p>{escape(text.strip())}</p>{_table(header, rows)}"
+
+
+def _lag_words(gps: GpsComparison) -> str:
+    if gps.lag_sigma_s is None:
+        return "the lag of its clock could not be told, and none is applied."
+    direction = "behind" if gps.lag_s > 0 else "ahead of"
+    lag = f"{abs(gps.lag_s):.4f} s (± {1000 * gps.lag_sigma_s:.1f} ms)"
+    return f"its clock runs {direction} the video's by {lag}, found from the motion itself."
 
 
 def _inputs(content: ReportContent) -> str:
@@ -327,13 +364,16 @@ def _calibration(content: ReportContent) -> str:
     rows = [
         [
             correction.name,
-            correction.before,
-            correction.after,
+            _signed(correction.before),
+            _signed(correction.after),
             _signed(f"{correction.in_priors:+z.2f}") + (" !" if abs(correction.in_priors) > SUSPICIOUS else ""),
         ]
         for correction in content.corrections
     ]
-    return note + _table(["parameter", "before", "after", "change in prior sigmas"], rows)
+    names = {correction.name for correction in content.corrections}
+    legend = ", ".join(words for name, words in _LENS_WORDS.items() if name in names)
+    words = f"<p>{escape(legend)}.</p>" if legend else ""
+    return note + _table(["parameter", "before", "after ± 1 σ", "change, in σ of what was given"], rows) + words
 
 
 def _limitations(project: Project) -> list[str]:
@@ -402,16 +442,19 @@ def _figure(figure: ReportFigure) -> str:
 
 
 _STYLE = """
-@page { size: A4; margin: 18mm 16mm; }
+@page { size: A4; margin: 18mm 16mm;
+  @bottom-left { content: "Rooftrack, displacement report"; font: 8pt sans-serif; color: #555; }
+  @bottom-right { content: "page " counter(page) " of " counter(pages); font: 8pt sans-serif; color: #555; } }
 body { font: 10pt/1.45 "Segoe UI", "Helvetica Neue", Arial, "DejaVu Sans", sans-serif; color: #1a1a1a; background: #fff;
-  max-width: 178mm; margin: 12mm auto; padding: 0 6mm; }
+  max-width: 178mm; margin: 12mm auto; padding: 0 6mm; counter-reset: figure; }
+.kind { font-size: 10pt; color: #555; margin: 0; }
 h1 { font-size: 20pt; margin: 0 0 1mm; }
 h2 { font-size: 13pt; margin: 9mm 0 2mm; border-bottom: 0.3mm solid #bbb; padding-bottom: 1mm; break-after: avoid; }
 h3 { font-size: 11pt; margin: 5mm 0 2mm; break-after: avoid; }
 h4 { font-size: 10pt; margin: 4mm 0 1mm; break-after: avoid; }
 table { border-collapse: collapse; width: 100%; font-size: 8.5pt; margin: 2mm 0; }
 thead { display: table-header-group; }
-tr, figure { break-inside: avoid; }
+tr, figure, dl, li { break-inside: avoid; }
 th { text-align: left; font-weight: 600; border-bottom: 0.3mm solid #666; vertical-align: bottom; }
 th, td { padding: 0.8mm 1.5mm; }
 td { border-bottom: 0.15mm solid #ddd; overflow-wrap: anywhere; }
@@ -422,7 +465,9 @@ dt { color: #555; }
 dd { margin: 0; overflow-wrap: anywhere; }
 figure { margin: 4mm 0; }
 img { max-width: 100%; }
+figure { counter-increment: figure; }
 figcaption { font-size: 8.5pt; color: #444; }
+figcaption::before { content: "Figure " counter(figure) ". "; font-weight: 600; }
 @media print { body { margin: 0; padding: 0; max-width: none; } }
 """
 _PAGE = """<!doctype html>
@@ -435,7 +480,7 @@ _PAGE = """<!doctype html>
 <style>{style}</style>
 </head>
 <body>
-<header><h1>{title}</h1>{head}</header>
+<header><p class="kind">Displacement report</p><h1>{title}</h1>{head}</header>
 {body}
 </body>
 </html>

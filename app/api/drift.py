@@ -11,13 +11,13 @@ from pydantic import Field
 from app.api.projects import Body
 from app.context import Context, Folder, Here
 from app.errors import Missing
-from app.outcome import by_method
+from app.outcome import Shown, by_method
 from app.store import ProjectFolder
 from core.coordinates import Floats
 from core.drift import amplitude_spectrum, corner_sweep, filter_warnings, high_pass
 from core.errors import InputError
 from core.project import Drift, Positive
-from core.results import TargetHistory, plain
+from core.results import plain
 from core.solve import unfiltered_history
 
 router = APIRouter(prefix="/api/projects/{project_id}")
@@ -40,23 +40,29 @@ class Filter(Body):
 @router.post("/drift")
 def drift(wanted: Filter, folder: Folder, here: Here) -> dict[str, Any]:
     """Return the uncorrected displacement and what a filter makes of it, with warnings in words."""
-    history, raw = _raw(here, folder, wanted.target, wanted.point)
+    shown, raw = _raw(here, folder, wanted.target, wanted.point)
+    history = shown.history
     intervals, steady = folder.load().project.intervals_s, _steady(here, folder, wanted)
     filtered = high_pass(raw, history.time_s, wanted.corner_hz, wanted.order)
+    warnings = filter_warnings(raw, filtered, history.time_s, intervals, corner_hz=wanted.corner_hz, steady_m=steady)
     at_rest = None
     if wanted.interval is not None:
-        found = corner_sweep(raw, history.time_s, wanted.interval, corners_hz=[wanted.corner_hz], order=wanted.order)
-        at_rest = {"dx": plain(found.rms_m[0, 0]), "dy": plain(found.rms_m[0, 1])}
+        try:
+            found = corner_sweep(
+                raw, history.time_s, wanted.interval, corners_hz=[wanted.corner_hz], order=wanted.order
+            )
+            at_rest = {"dx": plain(found.rms_m[0, 0]), "dy": plain(found.rms_m[0, 1])}
+        except InputError as error:  # the curves are worth looking at all the same
+            warnings.append(str(error))
     return {
         "frame": history.frame.tolist(),
         "time_s": plain(history.time_s),
         "status": history.status.tolist(),
         "raw": _axes(raw),
         "filtered": _axes(filtered),
-        "warnings": filter_warnings(
-            raw, filtered, history.time_s, intervals, corner_hz=wanted.corner_hz, steady_m=steady
-        ),
+        "warnings": warnings,
         "filtered_pre_event_rms_m": at_rest,
+        "is_earlier": shown.is_earlier,
     }
 
 
@@ -65,8 +71,8 @@ def sweep(
     target: str, start: float, end: float, folder: Folder, here: Here, point: PointName = "p1", order: Order = 10
 ) -> dict[str, Any]:
     """Return what each corner frequency would leave of the uncorrected displacement in an interval of rest."""
-    history, raw = _raw(here, folder, target, point)
-    found = corner_sweep(raw, history.time_s, (start, end), order=order)
+    shown, raw = _raw(here, folder, target, point)
+    found = corner_sweep(raw, shown.history.time_s, (start, end), order=order)
     knee = None
     if found.at_knee_m is not None and found.beyond_knee_m is not None:
         (dx, dy), (least_dx, least_dy) = plain(found.at_knee_m), plain(found.beyond_knee_m)
@@ -84,15 +90,15 @@ def spectrum(
     target: str, start: float, end: float, folder: Folder, here: Here, point: PointName = "p1"
 ) -> dict[str, Any]:
     """Return the Fourier amplitudes of the uncorrected displacement in an interval."""
-    history, raw = _raw(here, folder, target, point)
-    found = amplitude_spectrum(raw, history.time_s, (start, end))
+    shown, raw = _raw(here, folder, target, point)
+    found = amplitude_spectrum(raw, shown.history.time_s, (start, end))
     dx, dy = found.amplitude_m.T
     return {"frequency_hz": plain(found.frequency_hz), "dx_m": plain(dx), "dy_m": plain(dy)}
 
 
-def _raw(here: Context, folder: ProjectFolder, target: str, point: PointName) -> tuple[TargetHistory, Floats]:
-    history = here.outcomes.history(folder, folder.load().project, target)
-    return history, np.asarray(history.p1_raw_m if point == "p1" else history.p2_raw_m)
+def _raw(here: Context, folder: ProjectFolder, target: str, point: PointName) -> tuple[Shown, Floats]:
+    shown = here.outcomes.shown(folder, folder.load().project, target)
+    return shown, np.asarray(shown.history.p1_raw_m if point == "p1" else shown.history.p2_raw_m)
 
 
 def _steady(here: Context, folder: ProjectFolder, wanted: Filter) -> Floats | None:

@@ -18,7 +18,7 @@ from app.context import Context, Folder, Here
 from app.errors import ApiError, Invalid, NotYet
 from app.frames import fingerprint
 from app.lumas import luma_of
-from app.reference import H_plan_und, grid_of_frame, lens_of, reference_fit
+from app.reference import H_plan_und, grid_of_frame, lens_of, outside_frame, reference_fit
 from app.store import ProjectFolder, problem_of
 from core.camera import Pose
 from core.coordinates import Floats, apply_homography
@@ -51,13 +51,15 @@ def fit(folder: Folder, here: Here, wanted: Pairs | None = None) -> dict[str, An
         pairs = wanted.correspondences
     here.sites.begin(folder, project)
     coverage = _coverage(here, folder, project, pairs)
+    beside = ""
     try:
+        beside = outside_frame(folder, project, pairs)
         found = reference_fit(here, folder, project, pairs)
     except (InputError, ApiError) as error:
-        return _no_fit(pairs, problem_of(error), coverage)
+        return _no_fit(pairs, beside or problem_of(error), coverage)
     return {
         "state": "ok",
-        "message": "",
+        "message": beside,
         "rms_px": found.rms_px,
         "rms_m": found.rms_m,
         "loo_rms_px": found.left_out_rms_px,

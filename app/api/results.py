@@ -144,8 +144,12 @@ def results(folder: Folder, here: Here) -> dict[str, Any]:
 
 @router.get("/results/{target}")
 def history(target: str, folder: Folder, here: Here, method: Method | None = None) -> dict[str, Any]:
-    """Return a target's displacement, column by column as in its CSV; null where nothing was measured."""
-    return columns_of(here.outcomes.history(folder, folder.load().project, target, method))
+    """Return a target's displacement, column by column as in its CSV; null where nothing was measured.
+
+    `is_earlier` tells that the project cannot be solved as it stands: this is what the last run wrote.
+    """
+    shown = here.outcomes.shown(folder, folder.load().project, target, method)
+    return {**columns_of(shown.history), "is_earlier": shown.is_earlier}
 
 
 def columns_of(found: TargetHistory) -> dict[str, Any]:

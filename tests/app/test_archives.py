@@ -157,6 +157,22 @@ def test_a_folder_packed_by_hand_is_taken_too(client: TestClient, project: bytes
     assert restore(client, archive).status_code == 200
 
 
+@pytest.mark.parametrize("inside", ["Écho bâtiment/", "a/b/", ""])
+def test_what_a_system_adds_while_a_person_packs_is_left_out(
+    client: TestClient, workspace: Path, project: bytes, inside: str
+) -> None:
+    files = {f"{inside}project.json": project, f"{inside}vidéo.txt": b"v", f"{inside}.DS_Store": b"x"}
+    archive = packed(files | {f"__MACOSX/{inside}._project.json": b"x", f"{inside}Thumbs.db": b"x"})
+    made = restore(client, archive).json()["id"]
+    found = {path.relative_to(workspace / made).as_posix() for path in (workspace / made).rglob("*") if path.is_file()}
+    assert found == {"project.json", "vidéo.txt"}
+
+
+def test_a_broken_project_is_said_to_be_the_archives(client: TestClient) -> None:
+    message = restore(client, packed({}, b'{"rooftrack": 1')).json()["error"]["message"]
+    assert message.startswith("The project.json in the archive cannot be used: line 1")
+
+
 def test_files_keep_their_times(client: TestClient, workspace: Path) -> None:
     """By them it is told whether results are older than inputs."""
     for age_s, file in enumerate(("video.mp4", "lens.yaml"), start=1):

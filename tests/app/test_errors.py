@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -32,7 +34,7 @@ def assert_shape(answer: Any, what: str) -> None:
     assert answer.status_code >= 400, what
     body = answer.json()
     assert set(body["error"]) == {"message", "path", "kind"}, what
-    assert body["error"]["kind"] in ("input", "conflict", "missing", "busy", "internal"), what
+    assert body["error"]["kind"] in ("input", "conflict", "missing", "busy", "disk", "internal"), what
     message = body["error"]["message"]
     assert message.endswith("."), f"{what}: {message!r} is no sentence"
     assert "Traceback" not in message
@@ -98,3 +100,24 @@ def test_what_the_engine_raises_becomes_an_answer(raised: Exception, status: int
     answer = TestClient(app, raise_server_exceptions=False).get("/")
     assert (answer.status_code, answer.json()["error"]["kind"]) == (status, kind)
     assert answer.json()["error"]["message"] == message
+
+
+@pytest.mark.parametrize(
+    ("code", "words"), [(errno.ENOSPC, "The disk is full"), (errno.EACCES, "does not allow writing to project.json")]
+)
+def test_a_disk_that_refuses_is_told_in_a_sentence_and_the_edit_is_not_lost(
+    client: TestClient, workspace: Path, monkeypatch: pytest.MonkeyPatch, code: int, words: str
+) -> None:
+    before = (workspace / "small" / "project.json").read_bytes()
+    state = client.get("/api/projects/small").json()
+
+    def refuse(folder: Path, project: Any) -> None:
+        raise OSError(code, "no", str(folder / "project.json"))
+
+    monkeypatch.setattr("app.store.write_project", refuse)
+    edit = {"project": state["project"] | {"name": "other"}, "revision": state["revision"]}
+    answer = client.put("/api/projects/small", json=edit)
+    assert_shape(answer, "a refusing disk")
+    assert (answer.status_code, answer.json()["error"]["kind"]) == (507, "disk")
+    assert words in answer.json()["error"]["message"]
+    assert (workspace / "small" / "project.json").read_bytes() == before

@@ -51,6 +51,21 @@ def test_starts_that_cannot_be_fitted_are_named(client: TestClient) -> None:
     assert "collinear" in fit(client, line)["message"]
 
 
+def test_a_click_beside_the_frame_is_told_with_the_fit_and_in_its_step(client: TestClient) -> None:
+    state = client.get(SMALL).json()
+    clicked = state["project"]["correspondences"]
+    clicked[2]["frame_px"] = [160.0, 20.0]
+    assert fit(client, clicked)["message"] == "Pair 3 lies outside the 160 × 120 frame; move it, or switch it off."
+    clicked[4]["frame_px"] = [20.0, -0.6]
+    edit = {"project": state["project"] | {"correspondences": clicked}, "revision": state["revision"]}
+    step = client.put(SMALL, json=edit).json()["steps"]["correspondences"]
+    assert step["status"] == "error"
+    assert step["message"].startswith("Pairs 3, 5 lie outside")
+    for pair in (clicked[2], clicked[4]):
+        pair["enabled"] = False
+    assert "outside" not in fit(client, clicked)["message"]
+
+
 @pytest.mark.parametrize("to", ["und", "plan", "ortho", "world"])
 def test_points_go_there_and_back(client: TestClient, to: str) -> None:
     given = [[10.0, 20.0], [79.5, 59.5], [150.0, 100.0]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -66,6 +67,7 @@ def test_tracking_leaves_results_that_fit_the_project(tracked: TestClient) -> No
 
 def test_the_history_is_the_one_of_the_csv_and_follows_the_truth(tracked: TestClient) -> None:
     columns = tracked.get(f"{CLIP}/results/roof").json()
+    assert not columns.pop("is_earlier")
     assert ",".join(columns) == CSV_HEADER
     rows = list(csv.DictReader(io.StringIO(tracked.get(f"{CLIP}/files/roof.csv").text)))
     assert [float(row["p1_dx_m"]) for row in rows] == columns["p1_dx_m"]
@@ -146,6 +148,41 @@ def test_a_changed_project_makes_files_stale_and_is_solved_at_once(tracked: Test
     finally:
         tracked.post(f"{CLIP}/undo", json={"revision": changed["revision"]})
     assert not tracked.get(f"{CLIP}/results").json()["stale"]
+
+
+@contextlib.contextmanager
+def changed(client: TestClient, **change: Any) -> Iterator[None]:
+    """The project with a change that is undone afterwards."""
+    state = client.get(CLIP).json()
+    edit = {"project": state["project"] | change, "revision": state["revision"], "label": "change"}
+    revision = client.put(CLIP, json=edit).json()["revision"]
+    try:
+        yield
+    finally:
+        client.post(f"{CLIP}/undo", json={"revision": revision})
+
+
+def test_a_result_of_an_earlier_state_is_told_as_such(tracked: TestClient) -> None:
+    wanted = {"target": "roof", "corner_hz": 0.3, "interval": [0.0, 0.5]}
+    regions = tracked.get(CLIP).json()["project"]["moving_regions_px"]
+    with changed(tracked, moving_regions_px=[*regions, [[5, 5], [9, 5], [9, 9]]]):  # nothing is measured with these
+        assert tracked.get(f"{CLIP}/results/roof").json()["is_earlier"]
+        assert tracked.post(f"{CLIP}/drift", json=wanted).json()["is_earlier"]
+    with changed(tracked, excluded_frames=[[5, 7]]):
+        assert not tracked.get(f"{CLIP}/results/roof").json()["is_earlier"]
+        assert not tracked.post(f"{CLIP}/drift", json=wanted).json()["is_earlier"]
+
+
+def test_drift_is_drawn_though_nothing_is_measured_at_rest(tracked: TestClient) -> None:
+    wanted = {"target": "roof", "corner_hz": 0.3, "interval": [0.0, 0.5]}
+    with changed(tracked, excluded_frames=[[0, 12]]):
+        answer = tracked.post(f"{CLIP}/drift", json=wanted).json()
+        assert answer["filtered_pre_event_rms_m"] is None
+        assert any("no measured frame" in warning for warning in answer["warnings"])
+        assert answer["raw"]["dx"][20] is not None
+    with changed(tracked, excluded_frames=[[0, FRAMES - 1]]):
+        answer = tracked.post(f"{CLIP}/drift", json=wanted).json()
+        assert set(answer["status"]) == {"excluded"}
 
 
 def test_another_filter_of_a_motion_that_is_known_is_not_solved_anew(

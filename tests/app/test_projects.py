@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sqlite3
 import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import pytest
 from fastapi.testclient import TestClient
@@ -237,6 +239,47 @@ def test_a_project_is_made_from_files_or_from_nothing(client: TestClient, worksp
     assert client.get(f"/api/projects/{empty}").json()["steps"]["inputs"]["status"] == "todo"
     again = client.post("/api/projects", json={"name": "empty"}).json()["id"]
     assert again != empty
+
+
+@pytest.mark.parametrize(
+    ("name", "folder"),
+    [
+        ("Écho bâtiment 3", "Écho bâtiment 3"),
+        ("E\u0301cho", "Écho"),
+        ("東京 7", "東京 7"),
+        ("Σεισμός: 5/3?", "Σεισμός- 5-3"),
+        ("con", "project con"),
+        ("LPT1.x", "project LPT1.x"),
+        ("..roof. ", "roof"),
+        ("ü" * 90, "ü" * 60),
+    ],
+)
+def test_a_folder_is_named_as_its_project_in_any_script(
+    client: TestClient, workspace: Path, name: str, folder: str
+) -> None:
+    made = client.post("/api/projects", json={"name": name}).json()["id"]
+    assert made == folder
+    assert (workspace / folder / "project.json").is_file()
+    address = f"/p/{quote(folder, safe='')}"
+    assert client.get(address, follow_redirects=False).headers["location"] == f"{address}/inputs"
+    archive = client.get(f"/api/projects/{quote(folder, safe='')}/archive")
+    assert archive.status_code == 200
+
+
+def test_a_folder_named_by_hand_is_a_project_too(client: TestClient, workspace: Path) -> None:
+    for folder in ("_brouillon #2 (été)", ".hidden"):
+        (workspace / folder).mkdir()
+        shutil.copy(workspace / "small" / "project.json", workspace / folder)
+    assert [found["id"] for found in client.get("/api/projects").json()] == ["_brouillon #2 (été)", "small"]
+    address = f"/p/{quote('_brouillon #2 (été)')}"
+    assert client.get(address).status_code == 200
+
+
+def test_a_video_that_was_there_is_missed(client: TestClient, workspace: Path) -> None:
+    (workspace / "small" / "video.mp4").rename(workspace / "small" / "elsewhere.mp4")
+    state = get(client)
+    assert state["steps"]["inputs"] == {"status": "error", "message": "Not found: video; choose it again."}
+    assert any("video.mp4" in problem for problem in state["problems"])
 
 
 def test_a_project_that_cannot_be_made_leaves_nothing(client: TestClient, workspace: Path) -> None:

@@ -34,6 +34,15 @@ def server(tmp_path_factory):
 
 
 @pytest.fixture
+def measured(headless, server, request):
+    """The measured sample as a project of its own for each test: its folder and its pages' address."""
+    workspace, address = server
+    name = folder_name(request)
+    shutil.copytree(headless, workspace / name)
+    return workspace / name, f"{address}/p/{name}"
+
+
+@pytest.fixture
 def project(server, request):
     """The sample as a project of its own for each test: its folder and its pages' address."""
     workspace, address = server

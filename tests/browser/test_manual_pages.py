@@ -745,6 +745,8 @@ def test_projects_are_copied_renamed_archived_restored_and_deleted_with_undo(bro
             page.get_by_role("button", name="Restore archive…").click()
         chooser.value.set_files(archive)
         expect(page.locator("[data-project]")).to_have_count(before + 1)
+        page.locator(".toast").get_by_role("button", name="Open").click()
+        expect(page.locator(".project-name")).to_have_text("Sample by hand")
     assert read_project(folder).name == "Sample by hand"
 
 

@@ -15,7 +15,7 @@ from core.drift import high_pass
 from core.project import read_project
 from core.results import read_history_csv
 from core.run import run_project
-from tests.browser.live import arrived, ask, eventually, folder_name, free_port, serving, watched
+from tests.browser.live import arrived, ask, eventually, free_port, serving, watched
 from tests.browser.steps import FRAME_SIZE
 
 FRAMES = 600
@@ -33,12 +33,9 @@ def finished(headless, server):
 
 
 @pytest.fixture
-def project(headless, server, request):
+def project(measured):
     """A project of its own for a test that changes it: its folder and its pages' address."""
-    workspace, address = server
-    name = folder_name(request)
-    shutil.copytree(headless, workspace / name)
-    return workspace / name, f"{address}/p/{name}"
+    return measured
 
 
 def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engine(browser, headless, tmp_path):

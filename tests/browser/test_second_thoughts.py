@@ -315,3 +315,37 @@ def test_a_look_at_what_is_not_there_yet_is_no_error(browser, project):
         page.goto(f"{address}/p/deleted-meanwhile")
         expect(page.locator("#main")).to_contain_text("there is no such project")
         expect(page.get_by_role("link", name="All projects")).to_be_visible()
+
+
+def test_undo_follows_a_number_typed_by_mistake(browser, project):
+    folder, pages = project
+    before = read_project(folder).targets[0].height_m
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions")
+        ready(page, "Reference frame")
+        height = page.get_by_role("textbox", name="Height above ground")
+        height.fill("18.5")
+        height.press("Enter")
+        page.get_by_role("button", name="Undo: Height of roof").wait_for()
+        height.press("Control+z")
+        saved(page)
+        expect(height).to_have_value(f"{before:.2f}")
+        height.press("9")  # what is being typed is the field's own
+        height.press("Control+z")
+        page.get_by_role("button", name="Redo: Height of roof").wait_for()
+    assert read_project(folder).targets[0].height_m == before
+
+
+def test_two_targets_never_share_a_result_file(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions")
+        page.get_by_role("button", name="Add target").click()
+        page.get_by_role("menuitem", name="Three lines").click()
+        page.locator("#targets li[data-target=table]").get_by_role("button", name="Actions for").click()
+        page.get_by_role("menuitem", name="Rename…").click()
+        page.get_by_role("dialog").get_by_role("textbox").fill("ROOF")
+        page.keyboard.press("Enter")
+        expect(page.locator(".toast")).to_contain_text("would share a result file")
+        expect(page.locator("#targets li[data-target=table]")).to_be_visible()
+    assert [target.name for target in read_project(folder).targets] == ["roof"]

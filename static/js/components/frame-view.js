@@ -2,7 +2,7 @@
 // one: fewer pixels while it moves, all of them as soon as it rests.
 
 import { Emitter } from "../lib/emitter.js";
-import { sentence } from "../lib/api.js";
+import { ApiError, sentence } from "../lib/api.js";
 import { h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
 import { busyOver } from "./busy.js";
@@ -87,6 +87,11 @@ export class FrameView extends Emitter {
     this.#showOverlay();
   }
 
+  /** Whether a frame is on the screen, with its overlay or without. @param {number} frame */
+  isShown(frame) {
+    return this.element.dataset.frame === String(frame);
+  }
+
   /** Not needed while only the 3D scene is seen. @param {boolean} active */
   setActive(active) {
     this.active = active;
@@ -148,10 +153,11 @@ export class FrameView extends Emitter {
     this.emit("shown", { review });
   }
 
-  /** A frame without overlay is still worth looking at; why there is none is told once. @param {unknown} error */
+  /** A frame without overlay is still worth looking at; why there is none is told once, by the page if it is a state. @param {unknown} error */
   #without(error) {
     const words = sentence(error);
-    if (words !== this.#told) toastError(error);
+    const isState = error instanceof ApiError && error.path === "track";
+    if (words !== this.#told && !isState) toastError(error);
     this.#told = words;
     return null;
   }

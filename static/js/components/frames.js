@@ -1,6 +1,6 @@
 // Frames of the video and what was measured on them, fetched before they are asked for.
 
-import { get, projectPath } from "../lib/api.js";
+import { get, picture, projectPath } from "../lib/api.js";
 import { PaneImage } from "./pane-image.js";
 
 /** @typedef {import("../lib/types.js").Point} Point */
@@ -119,11 +119,7 @@ export class FrameLibrary {
 
   /** @param {number} frame @param {number | null} width @returns {Promise<FrameImage>} */
   async #load(frame, width) {
-    const response = await fetch(`/api/${projectPath(this.projectId, `frames/${frame}.jpg`, { w: width })}`);
-    if (!response.ok) {
-      const body = await response.json().catch(() => null);
-      throw new Error(body?.error?.message ?? `Frame ${frame} could not be read (${response.status}).`);
-    }
-    return new FrameImage(await createImageBitmap(await response.blob()), this.size);
+    const path = projectPath(this.projectId, `frames/${frame}.jpg`, { w: width });
+    return new FrameImage(await picture(`/api/${path}`), this.size);
   }
 }

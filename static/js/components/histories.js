@@ -23,6 +23,7 @@ import { get, projectPath } from "../lib/api.js";
  * @property {Column} p1_dy_raw_m
  * @property {Column} p2_dx_raw_m
  * @property {Column} p2_dy_raw_m
+ * @property {boolean} is_earlier the project cannot be solved as it stands: this is what the last run wrote
  *
  * @typedef {object} ResultFile
  * @property {string} name
@@ -68,9 +69,8 @@ const STATUS_ORDER = ["ok", "weak", "lost", "excluded"];
 export const fetchResults = (id) => get(projectPath(id, "results"));
 
 /** @param {string} id @param {string} target @param {string} [method] @returns {Promise<History>} */
-export async function fetchHistory(id, target, method) {
-  const answer = await get(projectPath(id, `results/${encodeURIComponent(target)}`, { method }));
-  return answer.columns ?? answer;
+export function fetchHistory(id, target, method) {
+  return get(projectPath(id, `results/${encodeURIComponent(target)}`, { method }));
 }
 
 /** Per frame the worst status of several targets. @param {string[][]} lists @returns {string[]} */

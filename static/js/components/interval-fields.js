@@ -2,6 +2,7 @@
 
 import { fill, h } from "../lib/dom.js";
 import { fixed } from "../lib/format.js";
+import { note } from "./notes.js";
 import { numberField } from "./number-field.js";
 
 /** @typedef {"pre_event" | "event" | "residual"} IntervalName */
@@ -13,6 +14,8 @@ export const INTERVALS = [
   { name: "event", label: "Event", colour: "--series-5", hint: "where peaks are looked for" },
   { name: "residual", label: "Residual", colour: "--series-4", hint: "averaged for the residual" },
 ];
+
+const LEAST_S = 1; // of an interval whose other end is not known yet
 
 /**
  * Fields for start and end of each interval.
@@ -26,9 +29,10 @@ export function intervalFields(host, onChange, end_s) {
   const rows = INTERVALS.map(({ name, label, colour, hint }) => {
     const change = (/** @type {0 | 1} */ end) => (/** @type {number | null} */ value) => {
       if (value === null) return onChange(name, null);
-      const known = current.get(name) ?? (end === 0 ? [value, value + 1] : [Math.max(0, value - 1), value]);
-      const wanted = /** @type {[number, number]} */ (end === 0 ? [value, known[1]] : [known[0], value]);
-      onChange(name, wanted[0] < wanted[1] ? wanted : [Math.min(...wanted), Math.max(...wanted) + 0.1]);
+      const [start, stop] = current.get(name) ?? [value, value];
+      // What is typed stays; the other end gives way.
+      if (end === 0) onChange(name, [value, stop > value ? stop : Math.min(value + LEAST_S, end_s())]);
+      else onChange(name, [start < value ? start : Math.max(0, value - LEAST_S), value]);
     };
     const field = (/** @type {0 | 1} */ end) =>
       numberField({
@@ -57,6 +61,7 @@ export function intervalFields(host, onChange, end_s) {
     );
     return { name, from, to, element };
   });
+  const words = h("div", { class: "interval-words", role: "status" });
   fill(
     host,
     h(
@@ -64,6 +69,7 @@ export function intervalFields(host, onChange, end_s) {
       { class: "interval-rows" },
       rows.map((row) => row.element),
     ),
+    words,
   );
   return {
     /** @param {import("../lib/types.js").Project["intervals_s"]} intervals */
@@ -73,6 +79,24 @@ export function intervalFields(host, onChange, end_s) {
         from.set(intervals[name]?.[0] ?? null);
         to.set(intervals[name]?.[1] ?? null);
       }
+      fill(words, overlapNotes(intervals));
     },
   };
+}
+
+/** What is wrong with intervals that overlap the event. @param {import("../lib/types.js").Project["intervals_s"]} intervals */
+function overlapNotes({ pre_event, event, residual }) {
+  const before = sharedWords(pre_event, event);
+  const after = sharedWords(residual, event);
+  return [
+    before && note("warn", `Pre-event and event share ${before}. Nothing may move before the event: displacement is counted from the mean there.`),
+    after && note("warn", `Event and residual share ${after}. The residual is a mean, and the shaking would be part of it.`),
+  ];
+}
+
+/** @param {Seconds} a @param {Seconds} b @returns {string | null} null where they share nothing */
+function sharedWords(a, b) {
+  if (a === null || b === null) return null;
+  const [from, to] = [Math.max(a[0], b[0]), Math.min(a[1], b[1])];
+  return from < to ? `${fixed(from, 2)} to ${fixed(to, 2)} s` : null;
 }

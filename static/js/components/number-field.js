@@ -39,6 +39,7 @@ export function numberField(options) {
   const show = () => {
     input.value = written();
     input.removeAttribute("aria-invalid");
+    input.dataset.atRest = ""; // so undo is the page's
   };
   const take = (/** @type {number | null} */ value) => {
     const isNew = value !== current;
@@ -63,6 +64,7 @@ export function numberField(options) {
     take(Math.min(greatest(), Math.max(min, wanted)));
     if (wanted !== current) refuse(wanted);
   };
+  input.addEventListener("input", () => delete input.dataset.atRest);
   input.addEventListener("change", read);
   input.addEventListener("blur", show); // after "change": what could not be used, or what came meanwhile
   input.addEventListener("keydown", (event) => {

@@ -1,5 +1,7 @@
 // A picture and its halved copies, so that a zoomed-out pane draws few pixels and does not shimmer.
 
+import { picture } from "../lib/api.js";
+
 const SMALLEST_LEVEL_PX = 700;
 
 export class PaneImage {
@@ -17,9 +19,7 @@ export class PaneImage {
    * @param {{signal?: AbortSignal, onLevel?: () => void}} [options]
    */
   static async load(url, { signal, onLevel } = {}) {
-    const response = await fetch(url, { signal });
-    if (!response.ok) throw new Error(await refusal(response));
-    const image = new PaneImage(await createImageBitmap(await response.blob()));
+    const image = new PaneImage(await picture(url, signal));
     void image.#addLevels(onLevel);
     return image;
   }
@@ -41,10 +41,4 @@ export class PaneImage {
     while (index + 1 < this.levels.length && deviceScale * 2 ** (index + 1) <= 1.01) index += 1;
     return this.levels[index];
   }
-}
-
-/** @param {Response} response */
-async function refusal(response) {
-  const body = await response.json().catch(() => null);
-  return body?.error?.message ?? `The picture could not be read (${response.status}).`;
 }

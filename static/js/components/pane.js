@@ -105,6 +105,7 @@ export class Pane extends Emitter {
       this.image !== null && image !== null && this.image.width === image.width && this.image.height === image.height;
     this.image = image;
     this.element.dataset.picture = image === null ? "" : `${image.width}x${image.height}`;
+    this.element.classList.toggle("upright", image !== null && image.height > image.width);
     if (image !== null && !same) this.fit();
     if (this.#at !== null) this.#hover(this.#at, shapeAt(this.#shapes, this.view, this.#at));
     this.emit("picture", image);

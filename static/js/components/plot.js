@@ -84,7 +84,7 @@ export class Plot extends Emitter {
     const head = h(
       "figcaption",
       { class: "plot-head" },
-      h("span", { class: "plot-title" }, options.title),
+      h("span", { class: "plot-title", title: options.title }, options.title),
       this.unitLabel,
       this.legend,
     );

@@ -2,6 +2,7 @@
 
 import { ApiError, post, projectPath } from "../lib/api.js";
 import { told } from "../lib/problems.js";
+import { fetchResults } from "./histories.js";
 import { isRunning } from "./job-card.js";
 import { toast, toastError } from "./toast.js";
 
@@ -14,17 +15,22 @@ import { toast, toastError } from "./toast.js";
 export class Solver {
   #busy = false;
   #again = false;
+  #following = false;
 
   /**
    * @param {Page} page
-   * @param {() => boolean} isFresh whether results are up to date
-   * @param {(busy: boolean) => void} [onBusy]
+   * @param {object} options
+   * @param {() => boolean} options.isFresh whether results are up to date
+   * @param {(busy: boolean) => void} options.onBusy
+   * @param {() => Promise<void>} options.reload the project has changed, and nobody makes results of it: show what there is
    */
-  constructor(page, isFresh, onBusy = () => undefined) {
+  constructor(page, { isFresh, onBusy, reload }) {
     this.page = page;
     this.isFresh = isFresh;
     this.onBusy = onBusy;
+    this.reload = reload;
     page.events.on("job", (job) => this.#onJob(job));
+    page.store.on("change", (change) => void this.#onChange(change).catch(toastError));
   }
 
   /**
@@ -35,8 +41,29 @@ export class Solver {
    */
   async edit(label, change, options = {}) {
     const wanted = this.isFresh() || this.#busy;
+    const { revision } = this.page.store;
     await this.page.store.edit(label, change, options);
-    if (wanted) await this.#solve();
+    if (wanted && this.page.store.revision !== revision) await this.#solve(); // else it was not saved
+  }
+
+  /** @param {import("../lib/store.js").StoreEvents["change"]} change */
+  async #onChange({ origin, project, previous }) {
+    if (origin === "undo") return this.#follow();
+    const elsewhere = origin === "server" && JSON.stringify(project) !== JSON.stringify(previous);
+    if (elsewhere || (origin === "saved" && !this.#busy && !this.isFresh())) await this.reload();
+  }
+
+  /** After undo or redo: results that were up to date are made so again, as after an edit, where that takes no video. */
+  async #follow() {
+    const wanted = this.isFresh() || this.#busy || this.#following;
+    this.#following = true;
+    try {
+      const { stale, measured } = await fetchResults(this.page.id);
+      if (wanted && stale && measured.includes(this.page.store.project.method)) await this.#solve();
+      else await this.reload();
+    } finally {
+      this.#following = false;
+    }
   }
 
   async #solve() {

@@ -2,7 +2,7 @@
 
 import { h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
-import { isAbort, sentence } from "../lib/api.js";
+import { ApiError, isAbort, sentence } from "../lib/api.js";
 
 /**
  * @typedef {object} ToastOptions
@@ -41,9 +41,10 @@ export function toast(message, { tone = "info", action, seconds = tone === "bad"
   return close;
 }
 
-/** Tell what went wrong in the engine's sentence; our own cancelling is no news. @param {unknown} error */
+/** Tell what went wrong in the engine's sentence; our own cancelling is no news, nor what a bar says already. @param {unknown} error */
 export function toastError(error) {
-  if (!isAbort(error)) toast(sentence(error), { tone: "bad" });
+  const said = error instanceof ApiError && error.kind === "offline" && document.querySelector(".connection-bar:not([hidden])");
+  if (!isAbort(error) && !said) toast(sentence(error), { tone: "bad" });
 }
 
 /** Say to assistive technology only. @param {string} message */

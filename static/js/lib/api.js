@@ -28,14 +28,18 @@ async function request(method, path, { json, body, signal } = {}) {
   const headers = new Headers(method === "GET" ? {} : GUARD);
   if (json !== undefined) headers.set("Content-Type", "application/json");
   const init = { method, headers, body: json === undefined ? body : JSON.stringify(json), signal };
-  let response;
+  const response = await fetched(`/api/${path}`, init);
+  return answer(response.status, await response.text());
+}
+
+/** @param {string} url @param {RequestInit} init */
+async function fetched(url, init) {
   try {
-    response = await fetch(`/api/${path}`, init);
+    return await fetch(url, init);
   } catch (error) {
-    if (error instanceof DOMException && error.name === "AbortError") throw error;
+    if (isAbort(error)) throw error;
     throw new ApiError(0, { message: "The Rooftrack server does not answer. Is it still running?", kind: "offline" });
   }
-  return answer(response.status, await response.text());
 }
 
 /** @param {number} status @param {string} text */
@@ -58,6 +62,13 @@ export const post = (path, json = {}, signal) => request("POST", path, { json, s
 export const put = (path, json) => request("PUT", path, { json });
 /** @param {string} path */
 export const remove = (path) => request("DELETE", path);
+
+/** A picture of the server's. @param {string} url @param {AbortSignal} [signal] */
+export async function picture(url, signal) {
+  const response = await fetched(url, { signal });
+  if (!response.ok) answer(response.status, await response.text());
+  return createImageBitmap(await response.blob());
+}
 
 /** Path of a project's resource, with query. @param {string} id @param {string} [rest] @param {Record<string, string | number | boolean | null | undefined>} [query] */
 export function projectPath(id, rest = "", query = {}) {

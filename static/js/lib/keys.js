@@ -46,6 +46,10 @@ function isTyping(target) {
   return target instanceof HTMLTextAreaElement || target instanceof HTMLSelectElement || target.isContentEditable;
 }
 
+/** Whether a command goes to the page although a field has the focus: nothing is being typed in it. @param {KeyboardEvent} event */
+const isAtRest = ({ target, ctrlKey, metaKey }) =>
+  (ctrlKey || metaKey) && target instanceof HTMLInputElement && target.dataset.atRest !== undefined;
+
 /** Whether this element uses the key itself. @param {EventTarget | null} target @param {string} name */
 function isOwnKey(target, name) {
   return (
@@ -58,7 +62,7 @@ function isOwnKey(target, name) {
 document.addEventListener("keydown", (event) => {
   if (event.defaultPrevented || document.querySelector("dialog[open]") !== null) return;
   const name = keyName(event);
-  const typing = isTyping(event.target);
+  const typing = isTyping(event.target) && !isAtRest(event);
   if (isOwnKey(event.target, name)) return;
   const binding = table.findLast(
     (entry) =>

@@ -4,8 +4,10 @@ import { get, post, projectPath, sentence } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { fixed, millimetres } from "../lib/format.js";
 import { latest } from "../lib/latest.js";
+import { told } from "../lib/problems.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { busyOver } from "../components/busy.js";
+import { earlierNote } from "../components/earlier-note.js";
 import { AXES, fetchHistory, fetchResults } from "../components/histories.js";
 import { INTERVALS, intervalFields } from "../components/interval-fields.js";
 import { whenMeasured } from "../components/measured.js";
@@ -21,7 +23,7 @@ import { toastError } from "../components/toast.js";
 /** @typedef {import("../components/interval-fields.js").IntervalName} IntervalName */
 /** @typedef {{dx: (number | null)[], dy: (number | null)[]}} Pair */
 /** @typedef {{dx: number, dy: number}} Rms */
-/** @typedef {{time_s: number[], raw: Pair, filtered: Pair, filtered_pre_event_rms_m: Rms | null, warnings: string[]}} DriftAnswer */
+/** @typedef {{time_s: number[], status: string[], raw: Pair, filtered: Pair, filtered_pre_event_rms_m: Rms | null, warnings: string[], is_earlier: boolean}} DriftAnswer */
 /** @typedef {{rms_m: Rms, least_m: Rms}} Knee what remains there, and the least that a higher corner leaves */
 /** @typedef {{corners_hz: number[], rms_m: Pair, knee_hz: number | null, knee: Knee | null}} Sweep */
 /** @typedef {{frequency_hz: number[], dx_m: number[], dy_m: number[]}} Spectrum */
@@ -121,6 +123,7 @@ const figures = h("div", { class: "figures" });
 const warnings = h("div", { class: "warnings", role: "status", "aria-live": "polite" });
 const intervalBox = h("div");
 const solving = h("span", { class: "badge accent", role: "status", hidden: true }, "Solving again…");
+const earlier = earlierNote(page);
 fill(find("#main"), stageElement(), sideElement());
 
 const history = new Plot(mainArea, { title: "Displacement", unit: "m", drag: "select" });
@@ -143,17 +146,17 @@ const spectrumPlot = new Plot(lowerArea, {
 const filtering = h("span", { class: "badge accent", role: "status", hidden: true }, "Solving…");
 solving.before(filtering);
 const fields = intervalFields(intervalBox, saveInterval, end_s);
-const refilter = latest(askFilter, showAnswer, (error) => (opened(), (filtering.hidden = true), toastError(error)));
+const refilter = latest(askFilter, showAnswer, showProblem);
 const resweep = latest(askSweep, showSweep, (error) => showSweepProblem(error));
 const respectrum = latest(askSpectra, showSpectra, () => undefined);
-const solver = new Solver(
-  page,
-  () => results.ready && !results.stale,
-  (busy) => {
+const solver = new Solver(page, {
+  isFresh: () => results.ready && !results.stale,
+  onBusy: (busy) => {
     solving.hidden = !busy;
     if (busy) filtering.hidden = true; // one word for both
   },
-);
+  reload,
+});
 
 history.on("select", ({ from, to }) => saveInterval("pre_event", [from, to]));
 history.on("interval", ({ key, from, to, done }) => moveInterval(/** @type {IntervalName} */ (key), [from, to], done));
@@ -162,6 +165,7 @@ sweepPlot.on("seek", ({ x }) =>
 );
 store.on("change", onProject);
 page.events.on("results", () => void reload().catch(toastError));
+page.events.on("online", () => void reload().catch(toastError));
 page.keys([
   {
     keys: "ArrowLeft / [",
@@ -198,6 +202,8 @@ page.keys([
   { keys: "Wheel", group: "Plots", label: "Zoom; Alt+drag pans, a double click shows all" },
 ]);
 onProject();
+const nothing = h("p", { hidden: true });
+mainArea.append(h("div", { class: "stage-empty", role: "status" }, nothing));
 const opened = busyOver(mainArea, "Solving…");
 await reload().catch(toastError);
 
@@ -215,6 +221,7 @@ function stageElement() {
       solving,
       axisChoice.element,
     ),
+    earlier.element,
     h("div", { class: "stage-body drift-stage" }, mainArea, lowerArea),
   );
 }
@@ -268,6 +275,7 @@ function sideElement() {
 /** Everything that depends on results. */
 async function reload() {
   results = await fetchResults(page.id);
+  earlier.show(results, { method: store.project.method, isEarlier: answer?.is_earlier ?? false });
   if (results.methods.includes("geometric"))
     geometric = await fetchHistory(page.id, target, "geometric").catch(() => null);
   ask();
@@ -332,6 +340,8 @@ async function askSpectra([start, end]) {
 function showAnswer(newest) {
   answer = newest;
   opened();
+  earlier.show(results, { method: store.project.method, isEarlier: newest.is_earlier });
+  const isBare = showNothing(newest.status);
   awaited.forEach(window.clearTimeout);
   awaited = [];
   filtering.hidden = true;
@@ -340,9 +350,34 @@ function showAnswer(newest) {
   showFigures();
   fill(
     warnings,
-    newest.warnings.map((words) => note("warn", words)),
-    newest.warnings.length ? null : note("info", "No warning for this corner frequency."),
+    isBare ? null : newest.warnings.map((words) => note("warn", told(words).words)),
+    isBare || newest.warnings.length ? null : note("info", "No warning for this corner frequency."),
   );
+}
+
+/** @param {unknown} error */
+function showProblem(error) {
+  opened();
+  filtering.hidden = true;
+  if (answer === null) tellNothing(sentence(error));
+  else toastError(error);
+}
+
+/** @param {string} words why there is no curve; none where there is one */
+function tellNothing(words) {
+  nothing.hidden = words === "";
+  nothing.textContent = words;
+}
+
+/** Say why there is no curve, where there is none. @param {string[]} statuses @returns {boolean} whether there is none */
+function showNothing(statuses) {
+  const isBare = !statuses.some((status) => status === "ok" || status === "weak");
+  const excluded = statuses.every((status) => status === "excluded");
+  const why = excluded
+    ? "Every frame is excluded, so there is nothing to draw. Take some back on the Review page."
+    : "No frame could be measured, so there is nothing to draw. The Review page shows what was found in each.";
+  tellNothing(isBare ? why : "");
+  return isBare;
 }
 
 /** Where the video ends: with its last frame's own duration. */
@@ -361,11 +396,13 @@ function drawHistory() {
   ];
   const columns = [answer.raw[key], answer.filtered[key]];
   if (geometric) {
-    traces.push({ label: "Geometric", colour: "--series-2", width: 1.6 });
+    const label = geometric.is_earlier ? "Geometric, before the change" : "Geometric";
+    traces.push({ label, colour: "--series-2", width: 1.6 });
     columns.push(geometric[column]);
-    history.setStatuses(geometric.status);
   }
-  if (history.traces.length === traces.length) history.setData([answer.time_s, ...columns]);
+  history.setStatuses(answer.status);
+  const names = (/** @type {{label: string}[]} */ of) => of.map(({ label }) => label).join();
+  if (names(history.traces) === names(traces)) history.setData([answer.time_s, ...columns]);
   else history.setTraces(traces, [answer.time_s, ...columns]);
 }
 
@@ -456,7 +493,7 @@ function showFigures() {
     h("div", {}, h("span", { class: "value" }, millimetres(value_m, 1)), h("span", { class: "name" }, name));
   const key = axis === "x" ? "dx" : "dy";
   const after = answer?.filtered_pre_event_rms_m?.[key];
-  const exact = results.summary?.targets?.[target]?.pre_event_rms_m?.[axis];
+  const exact = results.stale ? null : results.summary?.targets?.[target]?.pre_event_rms_m?.[axis];
   fill(
     figures,
     after == null ? null : figure(after, "filtered, pre-event RMS"),

@@ -6,6 +6,7 @@ import { centimetres, fixed, millimetres, plural, size } from "../lib/format.js"
 import { icon } from "../lib/icons.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { busyOver } from "../components/busy.js";
+import { fromBefore } from "../components/earlier-note.js";
 import { stepUrl } from "../components/header.js";
 import { AXES, fetchHistory, fetchResults } from "../components/histories.js";
 import { isRunning, jobCard } from "../components/job-card.js";
@@ -94,6 +95,7 @@ const errorPlot = new Plot(errorBox, { title: "Video less GPS", unit: "m", link:
 const reportJob = jobCard();
 
 page.events.on("results", () => void reload().catch(toastError));
+page.events.on("online", () => void reload().catch(toastError));
 page.store.on("change", ({ origin }) => origin === "undo" && void reload().catch(toastError));
 page.events.on("job", onJob);
 page.keys([
@@ -149,12 +151,9 @@ function showAll() {
 /** What is shown is the project's, or it says so. */
 function showBefore() {
   const nothing = validation === null && history === null && problem !== "";
-  const before = "The project has changed since it was tracked. This is the last result, from before the change.";
-  const words = note("warn", nothing ? problem : before);
-  words.classList.add("banner");
-  words.append(h("a", { class: "button small", href: stepUrl(page.id, "track") }, "Go to Track"));
-  beforeBox.hidden = !nothing && !isFromBefore();
-  fill(beforeBox, beforeBox.hidden ? null : words);
+  const before = isFromBefore() || Boolean(history?.is_earlier);
+  beforeBox.hidden = !nothing && !before;
+  fill(beforeBox, beforeBox.hidden ? null : fromBefore(page, nothing ? problem : undefined));
 }
 
 function draw() {
@@ -214,7 +213,12 @@ function showGps() {
     h("div", {}, h("span", { class: "value" }, value), h("span", { class: "name" }, name));
   fill(
     gpsBox,
-    h("header", {}, h("h2", {}, "Against GPS")),
+    h(
+      "header",
+      {},
+      h("h2", {}, "Against GPS"),
+      compared && validation === null && results.stale ? h("span", { class: "badge warn" }, "from before the change") : null,
+    ),
     given
       ? null
       : note(

@@ -209,8 +209,9 @@ async function restoreArchive() {
       bar.value = done / total;
       words.textContent = `${fixed((100 * done) / total, 0)} %`;
     };
-    await upload("POST", "projects/restore", file, sent, cancel.signal);
-    toast(`${file.name} was restored.`, { tone: "good" });
+    const { id } = await upload("POST", "projects/restore", file, sent, cancel.signal);
+    const open = () => location.assign(`/p/${encodeURIComponent(id)}`);
+    toast(`${file.name} was restored.`, { tone: "good", action: { label: "Open", run: open } });
   });
   row.remove();
 }

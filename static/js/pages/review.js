@@ -1,16 +1,16 @@
 // Review: look at every frame as the engine saw it, beside the motion it made of it.
 
-import { get, projectPath } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { count, fixed, plural } from "../lib/format.js";
 import { setView, viewNumber, viewText } from "../lib/view-state.js";
 import { busyOver } from "../components/busy.js";
+import { earlierNote } from "../components/earlier-note.js";
 import { ExclusionEditor } from "../components/exclusions.js";
 import { FrameLibrary } from "../components/frames.js";
 import { FrameView } from "../components/frame-view.js";
 import { AXES, fetchHistory, fetchResults, methodName, METHODS, worstStatuses } from "../components/histories.js";
 import { stepUrl } from "../components/header.js";
-import { whenMeasured } from "../components/measured.js";
+import { whenMeasured, whenVideo } from "../components/measured.js";
 import { openPage } from "../components/page.js";
 import { paneKeys } from "../components/pane-keys.js";
 import { Player } from "../components/player.js";
@@ -42,7 +42,7 @@ let results = await whenMeasured(
   page,
   "Track the video first; every frame can then be looked at here, with what was measured on it.",
 );
-const { video } = await get(projectPath(page.id, "inputs"));
+const video = await whenVideo(page, "Its frames are looked at here, with what was measured on each.");
 
 // what is looked at
 const has = (/** @type {string | null} */ name) => results.methods.find((method) => method === name);
@@ -82,6 +82,7 @@ const compareSwitch = h("input", {
 });
 const compareLabel = h("label", { class: "switch small" }, compareSwitch, "Compare methods");
 const solving = h("span", { class: "badge accent", role: "status", hidden: true }, "Solving again…");
+const earlier = earlierNote(page);
 const facts = h("section", { class: "section", "aria-label": "This frame" });
 const doubtful = h("section", { class: "section", "aria-label": "Weak and lost frames" });
 const excluded = h("section", { class: "section", "aria-label": "Excluded frames" });
@@ -104,6 +105,7 @@ fill(
       compareLabel,
       methodChoice.element,
     ),
+    earlier.element,
     stageBody,
     transport,
     plotArea,
@@ -120,11 +122,11 @@ const player = new Player(transport);
 const plots = AXES.map(
   (axis) => new Plot(plotArea, { title: axis.title, unit: "m", link: "review", drag: "seek", leastSpan: 0.002 }),
 );
-const solver = new Solver(
-  page,
-  () => results.ready && !results.stale,
-  (busy) => (solving.hidden = !busy),
-);
+const solver = new Solver(page, {
+  isFresh: () => results.ready && !results.stale,
+  onBusy: (busy) => (solving.hidden = !busy),
+  reload: refresh,
+});
 const exclusions = new ExclusionEditor(excluded, {
   store,
   solver,
@@ -136,10 +138,11 @@ listen();
 page.keys(keys());
 showLayers();
 view.setLayers(layers);
+exclusions.show();
+chooseStage(stage);
 const opened = busyOver(stageBody, "Solving…");
 await loadHistories().catch(toastError);
 opened();
-chooseStage(stage);
 player.go(viewNumber("frame", store.project.reference_frame));
 
 function listen() {
@@ -152,6 +155,7 @@ function listen() {
     plot.on("interval", ({ from, to }) => exclusions.select(from, to));
   }
   page.events.on("results", () => void refresh().catch(toastError));
+  page.events.on("online", () => void refresh().catch(toastError));
   store.on("change", () => exclusions.show());
 }
 
@@ -243,6 +247,7 @@ async function loadHistories() {
     worstStatuses(results.targets.map((name) => histories.get(`${method}/${name}`)?.status ?? [])),
   );
   exclusions.setFrames(main.time_s);
+  earlier.show(results, { method, isEarlier: main.is_earlier });
   drawPlots(main);
   showDoubtful();
   showFacts();
@@ -273,7 +278,8 @@ function drawPlots(main) {
     ];
     const columns = [main[`p1_${axis}_m`], main[`p2_${axis}_m`]];
     if (beside) {
-      traces.push({ label: `P1 ${methodName(other).toLowerCase()}`, colour: "--series-4", dash: [3, 3] });
+      const label = `P1 ${methodName(other).toLowerCase()}${beside.is_earlier ? ", before the change" : ""}`;
+      traces.push({ label, colour: "--series-4", dash: [3, 3] });
       columns.push(beside[`p1_${axis}_m`]);
     }
     plot.setTraces(traces, [main.time_s, ...columns]);
@@ -341,6 +347,7 @@ function chooseStage(wanted) {
   setView({ view: wanted === "frame" ? null : wanted });
   scene.setActive(wanted !== "frame", player.frame);
   view.setActive(wanted !== "scene");
+  showFacts();
 }
 
 function nextStage() {
@@ -421,7 +428,6 @@ function showFacts() {
   const i = player.frame;
   const status = main.status[i] ?? "ok";
   const turn = main.rotation_rad[i];
-  const ground = view.review?.frame === i ? view.review.ground : null;
   const row = (/** @type {"p1" | "p2"} */ point) =>
     h(
       "tr",
@@ -459,14 +465,16 @@ function showFacts() {
       h("dd", {}, `${fixed(main.time_s[i], 3)} s`),
       h("dt", {}, "Rotation"),
       h("dd", {}, turn === null || turn === undefined ? "–" : `${fixed(turn * 1000, 2)} mrad`),
-      h("dt", {}, "Ground"),
-      h(
-        "dd",
-        {},
-        ground ? `${plural(ground.used.length, "feature")} used, ${count(ground.rejected.length)} rejected` : "…",
-      ),
+      stage === "scene" ? null : [h("dt", {}, "Ground"), h("dd", {}, groundWords(i))],
     ),
   );
+}
+
+/** What is known of the ground in a frame: known only where the frame is looked at. @param {number} frame */
+function groundWords(frame) {
+  const ground = view.review?.frame === frame ? view.review.ground : null;
+  if (ground) return `${plural(ground.used.length, "feature")} used, ${count(ground.rejected.length)} rejected`;
+  return view.isShown(frame) ? "–" : "…";
 }
 
 /** @param {History} history @param {number} i @param {"p1" | "p2"} point @param {"dx" | "dy"} axis */

@@ -19,8 +19,6 @@ import { centimetres, fixed, metres, degrees, pixels } from "../../lib/format.js
  * @property {{centre_m: [number, number, number], height_m: number, tilt_deg: number, azimuth_deg: number} | null} camera
  */
 
-const TONES = /** @type {Record<string, string>} */ ({ ok: "good", too_few: "", collinear: "warn" });
-
 /** @param {HTMLElement} element */
 export function fitPanel(element) {
   const figures = h("div", { class: "figures four" });
@@ -45,12 +43,9 @@ export function fitPanel(element) {
       figure(pixels(fit.loo_rms_px), "leave-one-out"),
     );
     message.hidden = !fit.message;
-    message.className = `note ${TONES[fit.state] ?? "warn"}`;
-    fill(
-      message,
-      icon(fit.state === "ok" ? "check" : fit.state === "too_few" ? "info" : "warn"),
-      h("span", {}, told(fit.message).words),
-    );
+    const early = fit.state === "too_few";
+    message.className = `note ${early ? "" : "warn"}`;
+    fill(message, icon(early ? "info" : "warn"), h("span", {}, told(fit.message).words));
     showCoverage(grid, fit.coverage);
     fill(
       camera,

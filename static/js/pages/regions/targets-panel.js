@@ -143,9 +143,12 @@ async function rename(targets, name) {
     hint: "Letters, digits, - and _. It names the result file.",
   });
   if (wanted === null || wanted === name) return;
+  // On some systems one file would be both.
+  const same = targets.all.find((other) => other.name !== name && other.name.toLowerCase() === wanted.toLowerCase());
   if (!TARGET_NAME.test(wanted))
     toast(`“${wanted}” cannot name a file: use letters, digits, - and _ only.`, { tone: "bad" });
-  else if (targets.all.some((target) => target.name === wanted))
-    toast(`There is already a target “${wanted}”.`, { tone: "bad" });
+  else if (same?.name === wanted) toast(`There is already a target “${wanted}”.`, { tone: "bad" });
+  else if (same)
+    toast(`“${wanted}” and “${same.name}” would share a result file on some computers; choose another name.`, { tone: "bad" });
   else targets.rename(name, wanted);
 }
