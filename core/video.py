@@ -367,20 +367,34 @@ def read_frames_rgb(path: File, start: int = 0, stop: int | None = None) -> Iter
 def _decoded(
     path: File, index: FrameIndex | None, *, start: int, stop: int | None, threads: int
 ) -> Iterator[VideoFrame]:
-    """Yield what can be decoded of frames `start` to `stop`, or of the whole file where there is no index."""
+    """Yield what can be decoded of frames `start` to `stop`, or of the whole file where there is no index.
+
+    Raises:
+        InputError: there is no such frame, the file cannot be read on, or pictures of another size begin in it.
+    """
     if index is not None and start >= len(index):
         raise InputError(f"{path}: has {len(index)} frames, so there is no frame {start}; choose a smaller number.")
     with opened_video(path) as (container, stream):
         stream.codec_context.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
+        size = stream.width, stream.height
         if index is not None and start > 0:
             _seek(container, stream, index, start)
         for picture in decoded_pictures(container, stream):
+            if (picture.width, picture.height) != size:
+                raise InputError(
+                    f"{path}: its picture {_since_start_s(picture, stream):.2f} s after the start is {picture.width} x "
+                    f"{picture.height} pixels, but it begins with {size[0]} x {size[1]}; cut it where the size changes."
+                )
             number = None if index is None else index.number_at(picture.pts)
             if number is not None and stop is not None and number >= stop:
                 return
             if index is None or (number is not None and number >= start):
                 yield picture
+
+
+def _since_start_s(picture: VideoFrame, stream: VideoStream) -> float:
+    return float(((picture.pts or 0) - (stream.start_time or 0)) * (stream.time_base or 0))
 
 
 def decoded_pictures(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
