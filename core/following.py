@@ -36,6 +36,10 @@ NEIGHBOURS_M = 1.4
 LINE_SEARCH_M = 0.14
 # Every so many frames the whole picture confirms that no neighbouring strip has been taken.
 CONFIRM_EVERY = 15
+# A step that predicts nothing, plan metres: shorter than the noise of the cleanest frame, as in a picture shown again,
+# or longer than a roof goes between two frames, as in the picture that follows it.
+NO_STEP_M = 5e-5
+TOO_LONG_STEP_M = 0.3
 # Another place than where strips were found must show this part of them at least.
 AS_WELL = 0.8
 # Stations of a line that must be seen for it to count.
@@ -45,10 +49,17 @@ POINTS = 160
 
 @dataclass(frozen=True)
 class Apparent:
-    """Apparent rigid motion of a target in rays of the reference frame."""
+    """Apparent rigid motion of a target in rays of the reference frame.
+
+    Attributes:
+        shift: (2,).
+        rotation_rad: about the target's middle.
+        step: of a prediction, how far the target has gone from the frame before the last to the last; else None.
+    """
 
     shift: Floats
     rotation_rad: float
+    step: float | None = None
 
     @staticmethod
     def none() -> Apparent:
@@ -60,6 +71,7 @@ class Apparent:
         return Apparent(
             self.shift + factor * (self.shift - earlier.shift),
             self.rotation_rad + factor * (self.rotation_rad - earlier.rotation_rad),
+            float(np.linalg.norm(self.shift - earlier.shift)),
         )
 
     def apply(self, points: Floats, centre: Floats) -> Floats:
@@ -164,6 +176,7 @@ class LinesFollower:
         self, luma: Luma, ends: Floats, lens: Lens, *, widths_px: list[float], scale: Scale, names: list[str]
     ) -> None:
         self._lens = lens
+        self._scale = scale
         self._search_px = LINE_SEARCH_M * scale.pixels_per_m
         self._centre = ends.reshape(-1, 2).mean(axis=0)
         still = self._mapping(np.eye(3), Apparent.none())
@@ -189,6 +202,7 @@ class LinesFollower:
     ) -> TargetMatch:
         """Return the lines in a frame; see `Follower.find`."""
         found = self._measure(luma, H_ray_ray0, predicted) if predicted is not None else None
+        confirm = confirm or (predicted is not None and self._may_mislead(predicted))
         if found is not None and self._may_be_kept(luma, H_ray_ray0, found.apparent, confirm):
             return found
         seen = self._finder.search(luma, H_ray_ray0)
@@ -200,6 +214,10 @@ class LinesFollower:
             # The picture is mistaken: something else that looks alike lies there.
             return found
         return there
+
+    def _may_mislead(self, predicted: Apparent) -> bool:
+        step_m = None if predicted.step is None else predicted.step / self._scale.rays_per_m
+        return step_m is not None and not NO_STEP_M < step_m < TOO_LONG_STEP_M
 
     def _may_be_kept(self, luma: Luma, H_ray_ray0: Floats, apparent: Apparent | None, confirm: bool) -> bool:
         return apparent is not None and (not confirm or self._finder.agrees(luma, H_ray_ray0, apparent))

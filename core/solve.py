@@ -15,6 +15,7 @@ from core.lens import Lens
 from core.measurements import Recording
 from core.project import Drift, Intervals, Project, Target
 from core.relief import Relief
+from core.repeats import repeated_pictures, repeats_sentence, without_pictures
 from core.results import TargetHistory, relative_history
 from core.solution import Solution
 from core.solve_geometric import solve_geometric
@@ -35,12 +36,19 @@ def solve(
     Raises:
         InputError: the clicks, the lens, a height or the filter do not do.
     """
+    repeated = repeated_pictures(recording)
+    if repeated.any():
+        recording = without_pictures(recording, repeated)
     if project.method == "paper":
         solution = solve_paper(recording, project, lens, relief, has_lens=has_lens)
     else:
         solution = solve_geometric(recording, project, lens, relief)
     contradiction = solution.reference.contradiction
-    warnings = (*([f"{contradiction}."] if contradiction else []), *solution.warnings)
+    warnings = (
+        *([f"{contradiction}."] if contradiction else []),
+        *([repeats_sentence(recording, repeated)] if repeated.any() else []),
+        *solution.warnings,
+    )
     return with_histories(replace(solution, warnings=warnings), project)
 
 

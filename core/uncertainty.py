@@ -29,7 +29,9 @@ LEAST_WANDERING = 0.7
 MOVING = 1.3
 # By how much a second difference a - 2 b + c scatters more than the values: the root of 1 + 4 + 1.
 SECOND_DIFFERENCE = np.sqrt(6.0)
-# Stationary frames from which the scatter at rest is believed.
+# Stationary frames from which the scatter at rest is believed. A whole clip of fewer frames shows too little of its own
+# noise: standard deviations are then widened by the root of what is missing (2 sigma held 66 % in clips of 2 frames and
+# 85 % in clips of 14; widened they hold 90 to 97 %).
 LEAST_STILL = 30
 # Bounds of the correction by the scatter at rest: beyond them something other than random error is at work.
 LEAST_FACTOR, MOST_FACTOR = 0.3, 8.0
@@ -100,7 +102,7 @@ def combined_sigma(
     if still.sum() >= LEAST_STILL:
         factor = _by_scatter(np.hypot(random, slow_m)[still], places_m[still], MOST_FACTOR)
         rotation_factor = float(_by_scatter(points.rotation_rad[still], rotation_rad[still], MOST_FACTOR))
-    wider = np.where(moving, MOVING, 1.0)
+    wider = np.where(moving, MOVING, 1.0) * np.sqrt(max(1.0, LEAST_STILL / len(moving)))
     places_sigma = np.sqrt((random * factor) ** 2 + slow_m**2)
     return Sigma(places_sigma * wider[:, None, None], points.rotation_rad * rotation_factor * wider)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 
+from core.clock_times import EXAMPLES, ClockTime, finite, read_time, seconds
 from core.coordinates import Bools, Floats, read_only
 from core.errors import InputError
 from core.intervals import within
@@ -188,7 +190,7 @@ def read_gps(path: Path, settings: GpsInput) -> GpsRecord:
     """Read a GPS record: text with a header line and one position a line.
 
     Columns are separated by commas, semicolons or tabs; other columns, empty lines and lines that start with # are
-    passed over.
+    passed over. Times are seconds, or dates and times of day, which count from the first.
 
     Raises:
         InputError: names the file, and the missing column or the line at fault.
@@ -204,19 +206,35 @@ def read_gps(path: Path, settings: GpsInput) -> GpsRecord:
                 "project.json."
             )
     places = [header.index(name) for name in columns.values()]
-    rows = [_numbers(path, line, text, separator=separator, places=places, header=header) for line, text in lines[1:]]
+    rows = [_row(path, line, text, separator=separator, places=places, header=header) for line, text in lines[1:]]
     if len(rows) < 4:
         raise InputError(f"{path}: has {len(rows)} positions; at least four are needed for a comparison.")
-    table = np.array(rows, dtype=np.float64)
-    backwards = np.flatnonzero(np.diff(table[:, 0]) <= 0)
+    moments, positions = zip(*rows, strict=True)
+    _require_one_notation(path, columns["time"], moments, lines)
+    time_s = seconds(moments)
+    backwards = np.flatnonzero(np.diff(time_s) <= 0)
     if len(backwards):
         line = lines[backwards[0] + 2][0]
         raise InputError(
-            f'{path}: line {line}: "{columns["time"]}" is {table[backwards[0] + 1, 0]:g}, not after the line before '
-            f"({table[backwards[0], 0]:g}); sort the record and remove what is double."
+            f'{path}: line {line}: "{columns["time"]}" is {time_s[backwards[0] + 1]:g}, not after the line before '
+            f"({time_s[backwards[0]]:g}); sort the record and remove what is double."
         )
-    _require_one_stretch(path, table[:, 0], lines)
-    return GpsRecord(path.name, read_only(table[:, 0]), read_only(table[:, 1:]))
+    _require_one_stretch(path, time_s, lines)
+    return GpsRecord(path.name, read_only(time_s), read_only(positions))
+
+
+def _require_one_notation(path: Path, name: str, moments: Sequence[ClockTime], lines: list[tuple[int, str]]) -> None:
+    """Refuse times of which some are written in another way than the first.
+
+    Args:
+        lines: of the file, the header first.
+    """
+    first = moments[0].notation
+    for moment, (line, _) in zip(moments, lines[1:], strict=True):
+        if moment.notation is not first:
+            raise InputError(
+                f'{path}: line {line}: "{name}" is {moment.notation}, but {first} in the lines before; write all alike.'
+            )
 
 
 def _require_one_stretch(path: Path, time_s: Floats, lines: list[tuple[int, str]]) -> None:
@@ -272,22 +290,28 @@ def _content_lines(path: Path) -> list[tuple[int, str]]:
     return lines
 
 
-def _numbers(
+def _row(
     path: Path, line: int, text: str, *, separator: str, places: list[int], header: list[str]
-) -> tuple[float, ...]:
+) -> tuple[ClockTime, tuple[float, float]]:
+    """Return the time and the position in a line."""
     fields = next(csv.reader([text], delimiter=separator))
-    values = []
-    for place in places:
-        field = fields[place].strip() if place < len(fields) else ""
+    time_text, x_text, y_text = (fields[place].strip() if place < len(fields) else "" for place in places)
+
+    def refusal(place: int, field: str, wanted: str) -> InputError:
+        what = f'"{field}", not {wanted}' if field else "empty"
+        return InputError(f'{path}: line {line}: "{header[place]}" is {what}; correct or remove the line.')
+
+    try:
+        moment = read_time(time_text)
+    except ValueError:
+        raise refusal(places[0], time_text, f"a number or a time such as {EXAMPLES}") from None
+    position = []
+    for place, field in zip(places[1:], (x_text, y_text), strict=True):
         try:
-            value = float(field)
+            position.append(finite(field))
         except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            what = f'"{field}", not a number' if field else "empty"
-            raise InputError(f'{path}: line {line}: "{header[place]}" is {what}; correct or remove the line.')
-        values.append(value)
-    return tuple(values)
+            raise refusal(place, field, "a number") from None
+    return moment, (position[0], position[1])
 
 
 def compare_with_gps(

@@ -348,12 +348,17 @@ def read_frames_rgb(path: File, start: int = 0, stop: int | None = None) -> Iter
 def _decoded(
     path: File, index: FrameIndex, *, start: int, stop: int | None, threads: int
 ) -> Iterator[tuple[int, VideoFrame]]:
-    """Yield numbers and pictures of what can be decoded of frames `start` to `stop`."""
+    """Yield numbers and pictures of what can be decoded of frames `start` to `stop`.
+
+    Raises:
+        InputError: there is no such frame, the file cannot be read on, or pictures of another size begin in it.
+    """
     if start >= len(index):
         raise InputError(f"{path}: has {len(index)} frames, so there is no frame {start}; choose a smaller number.")
     with opened_video(path) as (container, stream):
         stream.codec_context.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
+        size = stream.width, stream.height
         if start > 0:
             _seek(container, stream, index, start)
         for picture in decoded_pictures(container, stream):
@@ -361,6 +366,11 @@ def _decoded(
             if number is not None and stop is not None and number >= stop:
                 return
             if number is not None and number >= start:
+                if (picture.width, picture.height) != size:
+                    raise InputError(
+                        f"{path}: frame {number}, {index.time_s_of(number):.2f} s after the start, is {picture.width} x "
+                        f"{picture.height} pixels, but the video begins with {size[0]} x {size[1]}; cut it there."
+                    )
                 yield number, picture
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -55,6 +56,16 @@ def test_a_neighbouring_strip_is_taken_until_the_whole_picture_is_looked_at() ->
     np.testing.assert_allclose(shift_px(unaware.apparent), [0.0, 30.0], atol=0.5)
     confirmed = follower().find(roof(), np.eye(3), NEIGHBOUR, confirm=True)
     np.testing.assert_allclose(shift_px(confirmed.apparent), [0.0, 0.0], atol=0.5)
+
+
+@pytest.mark.parametrize("step_m", [0.0, 0.5])
+def test_a_prediction_from_no_step_or_too_long_a_one_is_made_sure_of(step_m: float) -> None:
+    predicted = replace(NEIGHBOUR, step=step_m * PX_PER_M / FOCAL_PX)
+    found = follower().find(roof(), np.eye(3), predicted, confirm=False)
+    np.testing.assert_allclose(shift_px(found.apparent), [0.0, 0.0], atol=0.5)
+    usual = replace(NEIGHBOUR, step=0.01 * PX_PER_M / FOCAL_PX)
+    unaware = follower().find(roof(), np.eye(3), usual, confirm=False)
+    np.testing.assert_allclose(shift_px(unaware.apparent), [0.0, 30.0], atol=0.5)
 
 
 def test_a_mistaken_picture_does_not_cost_lines_that_are_seen_well(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,6 +35,7 @@ def test_camera_and_roof_go_on_for_as_long_as_a_frame_lies_ahead(time_s: float, 
     apparent = predict_apparent(before(), "roof", time_s)
     assert apparent is not None
     np.testing.assert_allclose(apparent.shift, [0.2 + 0.1 * steps, 0.0], atol=1e-12)
+    assert apparent.step == pytest.approx(0.1)
 
 
 def test_what_was_not_seen_predicts_nothing() -> None:

@@ -19,6 +19,7 @@ from core.relief import Relief
 from core.results import Status, TargetHistory
 from core.solution import Solution
 from core.solve_geometric import solve_geometric
+from core.uncertainty import LEAST_STILL
 from tests import exact_scene as scene
 
 NOISE_PX = 0.05
@@ -436,7 +437,9 @@ def test_error_bars_of_a_few_frames_hold_what_single_poses_err_by(frames: int) -
     ground[1:] += np.random.default_rng(4).normal(scale=0.3, size=ground[1:].shape)
     history = solved(replace(recording, ground_raw=ground), intervals_s={}).histories["roof"]
     ratio = ((history.p1_m - scene.truth(frames).p1_m) / history.p1_sigma_m)[1:]
-    assert 0.5 < np.sqrt((ratio**2).mean()) < 1.6
+    # This noise is new in each frame; they are widened for noise that is not, which so few frames cannot show.
+    widened = np.sqrt(LEAST_STILL / frames)
+    assert 0.5 < widened * np.sqrt((ratio**2).mean()) < 1.6
 
 
 def test_a_line_of_which_hardly_anything_is_seen_leaves_its_frame_lost() -> None:

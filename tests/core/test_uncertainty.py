@@ -47,6 +47,23 @@ def test_error_bars_are_held_against_the_scatter_at_rest(places_m: Floats) -> No
     np.testing.assert_allclose(sigma.rotation_rad[STILL].mean(), 1e-5, rtol=0.2)
 
 
+@pytest.mark.parametrize("frames", [1, 3, 29, 30, 60])
+def test_a_clip_of_few_frames_claims_less(frames: int) -> None:
+    claimed = combined_sigma(
+        Sigma(np.full((frames, 2, 2), 3e-4), np.full(frames, 2e-5)),
+        camera_m=np.zeros((frames, 2)),
+        shared_m=np.zeros(frames),
+        slow_m=np.zeros((frames, 2, 2)),
+        places_m=np.zeros((frames, 2, 2)),
+        rotation_rad=np.zeros(frames),
+        still=np.zeros(frames, dtype=bool),
+        moving=np.zeros(frames, dtype=bool),
+    )
+    widened = np.sqrt(max(1.0, 30 / frames))
+    np.testing.assert_allclose(claimed.places_m, 3e-4 * widened)
+    np.testing.assert_allclose(claimed.rotation_rad, 2e-5 * widened)
+
+
 def test_noise_is_told_from_drift() -> None:
     noise = np.random.default_rng(5).normal(scale=[3e-4, 6e-4], size=(FRAMES, 2))
     drift = 0.05 * np.sin(np.arange(FRAMES) / 40)[:, None]

@@ -246,12 +246,48 @@ def test_reads_named_columns_and_passes_over_the_rest(tmp_path: Path, separator:
             "time_s,east_m,north_m\n0,1,2\n# receiver on\n1700000000,1,2\n1700000000.5,1,2\n1700000001,1,2\n",
             r"line 4: its time is 1\.7e\+09 s after that of the line before, 0 s, .* 0\.5 s apart; correct the times",
         ),
+        (
+            "time_s,east_m,north_m\n0,1,2\n12:00 o'clock,1,2\n",
+            r'line 3: "time_s" is "12:00 o\'clock", not a number or a time such as 2026-03-01T12:00:00\.250Z',
+        ),
+        (
+            "time_s,east_m,north_m\n12:00:00,1,2\n12:00:01,1,2\n2.5,1,2\n12:00:03,1,2\n",
+            r'line 4: "time_s" is a number, but a time of day in the lines before; write all alike',
+        ),
+        (
+            "time_s,east_m,north_m\n2026-03-01 12:00,1,2\n2026-03-01 12:01Z,1,2\n2026-03-01 12:02,1,2\n"
+            "2026-03-01 12:03,1,2\n",
+            r"line 3: .* is a date and time with its time zone, but a date and time in the lines before",
+        ),
+        (
+            "time_s,east_m,north_m\n12:00:01,1,2\n12:00:03,1,2\n12:00:02,1,2\n12:00:04,1,2\n",
+            r'line 4: "time_s" is 1, not after the line before \(2\)',
+        ),
         ("", r"is empty"),
     ],
 )
 def test_bad_records_are_refused_by_line(tmp_path: Path, body: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_gps(write(tmp_path, body), settings())
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        "2026-03-01T23:59:59.{}Z",
+        "2026-03-01 23:59:59.{}",
+        "2026-03-01T23:59:59,{}+09:00",
+        "20260301T235959.{}Z",
+        "23:59:59.{}",
+    ],
+)
+def test_dates_and_times_of_day_count_from_the_first_to_the_microsecond(tmp_path: Path, start: str) -> None:
+    midnight = start.replace("23:59:59", "00:00:00").replace("235959", "000000").replace("03-01", "03-02")
+    midnight = midnight.replace("0301", "0302")
+    texts = [start.format("25"), start.format("250001"), start.format("999999"), midnight.format("000")]
+    body = "\n".join(["time_s;east_m;north_m", *(f"{text};1;2" for text in texts)])
+    time_s = read_gps(write(tmp_path, body), settings()).time_s
+    assert time_s.tolist() == [0.0, 1e-6, 0.749999, 0.75]
 
 
 def test_a_record_may_have_a_gap_of_days(tmp_path: Path) -> None:

@@ -118,6 +118,23 @@ def test_a_part_is_the_same_as_in_the_whole(video: Path, start: int) -> None:
         np.testing.assert_array_equal(one.luma, other.luma)
 
 
+@pytest.mark.parametrize("start", [0, 24, 40])
+def test_pictures_of_another_size_than_the_first_are_refused(tmp_path: Path, start: int) -> None:
+    # As a recorder makes it that changes its settings: transport streams can simply be put one behind the other.
+    options = {"bf": "0"}
+    large = write(tmp_path / "large.ts", frames=25, options=options, ticks=[40 * n for n in range(25)])
+    small = write(
+        tmp_path / "small.ts", frames=25, size=(64, 48), options=options, ticks=[40 * n for n in range(25, 50)]
+    )
+    file = tmp_path / "both.ts"
+    file.write_bytes(large.read_bytes() + small.read_bytes())
+    assert len(frame_index(file)) == 50
+    assert [frame.index for frame in read_frames(file, 5, 20)] == list(range(5, 20))
+    expected = r"both.ts: frame \d+, 1\.\d\d s after the start, is 64 x 48 pixels, but the video begins with 96 x 64; cut"
+    with pytest.raises(InputError, match=expected):
+        list(read_frames(file, start))
+
+
 def test_single_frames(video: Path) -> None:
     for number in (0, 25, 49):
         assert number_of(read_frame(video, number).luma) == number

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -77,6 +78,26 @@ def project_copy(clip: Path, folder: Path, **changes: Any) -> Path:
 def changed(project: Project, **changes: Any) -> Project:
     """Return a project with some values replaced, checked as if a person had written them."""
     return Project.model_validate({**project.model_dump(by_alias=True), **changes})
+
+
+def filmed_anew(clip: Path, folder: Path, change: Callable[[list[Any]], list[Any]], **changes: Any) -> Path:
+    """Return a new project of a clip whose pictures, YUV 4:2:0 planes one below another, are changed before coding."""
+    project_copy(clip, folder, **changes)
+    (folder / "video.mp4").unlink()
+    with av.open(str(clip / "video.mp4")) as given:
+        frames = list(given.decode(video=0))
+        rate = given.streams.video[0].average_rate
+    pictures = change([frame.to_ndarray(format="yuv420p") for frame in frames])
+    with av.open(str(folder / "video.mp4"), "w") as made:
+        stream = made.add_stream("libx264", rate=rate, options={"preset": "veryfast", "crf": "18"})
+        stream.width, stream.height = frames[0].width, frames[0].height
+        stream.codec_context.time_base = frames[0].time_base
+        for frame, picture in zip(frames, pictures, strict=True):
+            coded = av.VideoFrame.from_ndarray(picture, format="yuv420p")
+            coded.pts, coded.time_base = frame.pts, frame.time_base
+            made.mux(stream.encode(coded))
+        made.mux(stream.encode())
+    return folder
 
 
 def with_measurements(measured: Path, folder: Path, **changes: Any) -> Path:

@@ -37,6 +37,7 @@ from tests.packets import repacked
 from tests.scenes.clips import (
     BRIEF,
     displacement,
+    filmed_anew,
     measured,
     measured_history,
     project_copy,
@@ -134,6 +135,21 @@ def test_black_frames_are_lost_and_the_roof_is_found_again_at_once(clip, run, hi
     assert np.isfinite(displacement(history)[~black]).all()
     rows = (run / "results" / "roof.csv").read_text().splitlines()[1:]
     assert all(row.split(",", 3)[3] == "," * 14 for row, dark in zip(rows, black, strict=True) if dark)
+
+
+def test_a_picture_that_freezes_in_the_shaking_is_lost(clip, tmp_path):
+    frozen = slice(105, 120)
+
+    def with_repeats(pictures):
+        shown = list(pictures)
+        shown[frozen] = [pictures[frozen.start - 1]] * (frozen.stop - frozen.start)
+        return shown
+
+    history = measured_history(filmed_anew(clip, tmp_path / "frozen", with_repeats))
+    assert (history.status[frozen] == Status.LOST).all()
+    assert (history.status[[*range(70, 85), *range(120, 168)]] != Status.LOST).all()
+    error = displacement(history) - true_displacement(clip)
+    assert np.nanmax(np.abs(error)) < roof_pixel_m(BRIEF)
 
 
 def test_the_published_way_shows_the_exact_apparent_motion(clip, tmp_path):
