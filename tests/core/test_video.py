@@ -130,7 +130,7 @@ def test_pictures_of_another_size_than_the_first_are_refused(tmp_path: Path, sta
     file.write_bytes(large.read_bytes() + small.read_bytes())
     assert len(frame_index(file)) == 50
     assert [frame.index for frame in read_frames(file, 5, 20)] == list(range(5, 20))
-    expected = r"both.ts: frame \d+, 1\.\d\d s after the start, is 64 x 48 pixels, but the video begins with 96 x 64; cut"
+    expected = r"both.ts: frame \d+ \(1\.\d\d s\) is 64 x 48 pixels, but the video begins with 96 x 64; cut it there\."
     with pytest.raises(InputError, match=expected):
         list(read_frames(file, start))
 
