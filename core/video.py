@@ -368,8 +368,8 @@ def _decoded(
             if number is not None and number >= start:
                 if (picture.width, picture.height) != size:
                     raise InputError(
-                        f"{path}: frame {number} ({index.time_s_of(number):.2f} s) is {picture.width} x {picture.height} "
-                        f"pixels, but the video begins with {size[0]} x {size[1]}; cut it there."
+                        f"{path}: frame {number} ({index.time_s_of(number):.2f} s) is {picture.width} x "
+                        f"{picture.height} pixels, but the video begins with {size[0]} x {size[1]}; cut it there."
                     )
                 yield number, picture
 
