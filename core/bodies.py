@@ -86,6 +86,20 @@ class RestBody:
         assert at_rest is not None
         return rigid_with_weights(points, weight, at_rest, self.centre)
 
+    def growth(self, fit: RigidFit) -> Floats:
+        """Return by what part of itself the body appears larger than at rest, (F,); nan where not seen."""
+        if self.lines is not None:
+            seen = np.isfinite(fit.residual).any(axis=-1).all(axis=-1)
+            beyond = finite_median(fit.residual)
+            # A line beyond its place has shifted with the others, or lies further out by a part of its distance.
+            by_shift_or_growth = np.column_stack([self.lines.normal, self.lines.offset])
+            return np.asarray(np.where(seen, beyond @ np.linalg.pinv(by_shift_or_growth)[2], np.nan))
+        assert self.points is not None
+        arm = self.points - self.centre
+        outwards = (fit.weight[..., None] * np.nan_to_num(fit.residual) * arm).sum(axis=(1, 2))
+        whole = (fit.weight * (arm**2).sum(axis=-1)).sum(axis=1)
+        return np.asarray(np.where(whole > 0, outwards / np.maximum(whole, 1e-300), np.nan))
+
     def is_determined(self, fit: RigidFit) -> Bools:
         """Return (F,) whether frames fix the motion.
 

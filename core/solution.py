@@ -61,10 +61,13 @@ class TargetSolution:
     Attributes:
         history: displacement from rest.
         rest_m: (2, 2) P1 and P2 at rest, absolute world metres.
+        growth: (F,) by what part of itself the target appears larger than at rest, nan where not measured; None for
+            `paper`, whose scale follows what it sees.
     """
 
     history: TargetHistory
     rest_m: Floats
+    growth: Floats | None = None
 
 
 @dataclass(frozen=True)

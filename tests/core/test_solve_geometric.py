@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -101,25 +102,27 @@ def test_rest_is_where_points_lie_before_the_event_whatever_the_reference_frame_
     assert rms_mm(solution.histories["roof"]) < 0.1
 
 
-def test_a_textured_roof_seen_roughly_is_measured_with_a_larger_standard_deviation() -> None:
-    lines = scene.recording(0.02)
+def as_points(lines: Recording) -> tuple[Recording, dict[str, Any]]:
+    """The recording of a textured roof whose patches lie where edges of lines do, and what the project says of it."""
     patches = lines.targets_raw["roof"].reshape(scene.FRAMES, -1, 2)
-    rough = 60
-    noise = np.random.default_rng(7).normal(scale=0.2, size=patches.shape[1:])
-    patches = patches + np.where(np.arange(scene.FRAMES) == rough, 1.0, 0.0)[:, None, None] * noise
     reference = replace(lines.reference, targets_raw={"roof": lines.reference.targets_raw["roof"].reshape(-1, 2)})
     corners = [(-3.0, -2.0), (3.0, -2.0), (3.0, 2.0), (-3.0, 2.0)]
     region = [tuple(np.array(corner) + scene.ROOF_M + scene.SITE_M) for corner in corners]
     target = {"name": "roof", "kind": "points", "height_m": scene.HEIGHT_M, "region_m": region}
-    recording = replace(lines, reference=reference, targets_raw={"roof": patches})
-    history = solved(recording, targets=[target]).histories["roof"]
+    return replace(lines, reference=reference, targets_raw={"roof": patches}), {"targets": [target]}
+
+
+def test_a_textured_roof_seen_roughly_is_measured_with_a_larger_standard_deviation() -> None:
+    recording, textured = as_points(scene.recording(0.02))
+    patches = recording.targets_raw["roof"]
+    rough = 60
+    noise = np.random.default_rng(7).normal(scale=0.2, size=patches.shape[1:])
+    patches = patches + np.where(np.arange(scene.FRAMES) == rough, 1.0, 0.0)[:, None, None] * noise
+    history = solved(replace(recording, targets_raw={"roof": patches}), **textured).histories["roof"]
     assert (history.status == Status.OK).all()
     usual = np.median(history.p1_sigma_m, axis=0)
     assert (history.p1_sigma_m[rough] > 2.0 * usual).all()
     assert (np.abs(history.p1_m[rough] - scene.truth().p1_m[rough]) < 4.0 * history.p1_sigma_m[rough] + 1e-3).all()
-
-
-# --- what cannot be right --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kept", [0, 3, 40])
@@ -158,6 +161,34 @@ def test_a_pre_event_in_which_the_building_moves_is_told() -> None:
 
 
 @pytest.mark.filterwarnings("error")
+def zoomed(recording: Recording, factor: float) -> Recording:
+    """The recording as a lens shows it whose focal length changes by a factor in mid-clip, within a second."""
+    ahead = np.clip(recording.time_s - recording.time_s[len(recording.time_s) // 2], 0.0, 1.0)
+    zoom = 1.0 + (factor - 1.0) * ahead
+
+    def enlarged(raw: Floats) -> Floats:
+        und = scene.LENS.undistort(raw) - scene.LENS.centre_px
+        return scene.LENS.distort(zoom.reshape(-1, *[1] * (raw.ndim - 1)) * und + scene.LENS.centre_px)
+
+    targets = {name: enlarged(raw) for name, raw in recording.targets_raw.items()}
+    return replace(recording, ground_raw=enlarged(recording.ground_raw), targets_raw=targets)
+
+
+@pytest.mark.parametrize("kind", ["lines", "points"])
+def test_a_zoom_in_mid_clip_is_told_by_a_roof_that_seems_to_grow(kind: str) -> None:
+    steady = scene.recording(NOISE_PX)
+    changes = {}
+    if kind == "points":
+        steady, changes = as_points(steady)
+    height, roof = scene.pose(0).centre_m[2], scene.HEIGHT_M
+    for factor in (1.01, 0.99):
+        told = [words for words in solved(zoomed(steady, factor), **changes).warnings if "grow" in words]
+        assert len(told) == 1
+        percent = 100 * abs(factor - 1) * roof / (height - roof)
+        assert float(re.search(r"by ([\d.]+) %", told[0])[1]) == pytest.approx(percent, abs=0.11)
+    assert not any("grow" in words for words in solved(steady, **changes).warnings)
+
+
 def test_a_pre_event_in_which_nothing_was_measured_is_told() -> None:
     recording = scene.recording(NOISE_PX)
     roof = recording.targets_raw["roof"].copy()
