@@ -29,7 +29,7 @@ from core.roof_level import height_obstacle, refuse_if, scale_at_roof
 from core.row_times import Readout, at_frame_times, estimated_readout, ground_speed
 from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution, TargetSolution, frame_status
-from core.uncertainty import GROUND_PART, Sigma, combined_sigma, common_error, jitter
+from core.uncertainty import GROUND_PART, Sigma, combined_sigma, common_error, jitter, robust_jitter
 
 # Frames from which a rolling shutter is estimated.
 READOUT_FRAMES = 150
@@ -41,9 +41,11 @@ DISTANCE_TOLERANCE = 0.02
 # not where it is thought to be.
 UNREST_M = 2e-3
 UNREST = 3.0
-# No building grows. A part of itself by which a target does so from one second to another tells that focal length or
-# focus changed (0.04 % at most in rendered clips without; 0.8 % where the lens zooms by 1 %, which costs 14 mm).
+# No building grows. A target that does so from one second to another by more than this part of itself, and by so many
+# times the noise of a frame, tells that focal length or focus changed. (In rendered clips without, it is 0.04 %, or in
+# noisy ones five times the noise; where the lens zooms by 1 %, which costs 14 mm, it is 0.8 %.)
 MOST_GROWTH = 2e-3
+GROWTH_NOISE = 10.0
 GROWTH_S = 1.0
 GROWTH_FRAMES = 5
 
@@ -126,23 +128,22 @@ def _warnings(project: Project, targets: Mapping[str, TargetSolution], heights_m
                 f"P1 of {target.name} moves by {1e3 * moved_m:.1f} mm (RMS) in pre_event, steadily and not as noise: "
                 "it shakes there already, or height_m, the lens or the clicks are wrong."
             )
-        growth = _largest_growth(solved)
-        if growth > MOST_GROWTH:
+        growth, noise = _largest_growth(solved)
+        if growth > max(MOST_GROWTH, GROWTH_NOISE * noise):
             yield (
                 f"{target.name} seems to grow or shrink by {100 * growth:.1f} % during the clip, as if the camera had "
                 "zoomed or refocused, so its displacement is wrong; film with focal length and focus held fixed."
             )
 
 
-def _largest_growth(solved: TargetSolution) -> float:
-    """Return the largest change of a target's size from one second to another, each as the median of its frames."""
-    if solved.growth is None:
-        return 0.0
-    time_s, seen = solved.history.time_s, np.isfinite(solved.growth)
-    second = np.floor((time_s[seen] - time_s[0]) / GROWTH_S)
-    seconds = np.split(solved.growth[seen], np.flatnonzero(np.diff(second)) + 1)
+def _largest_growth(solved: TargetSolution) -> tuple[float, float]:
+    """Return the largest change of a target's size from one second to another, medians both, and a frame's noise."""
+    assert solved.growth is not None
+    seen = np.isfinite(solved.growth)
+    growth, time_s = solved.growth[seen], solved.history.time_s[seen]
+    seconds = np.split(growth, np.flatnonzero(np.diff(np.floor(time_s / GROWTH_S))) + 1)
     medians = [float(np.median(each)) for each in seconds if len(each) >= GROWTH_FRAMES]
-    return max(medians) - min(medians) if medians else 0.0
+    return (max(medians) - min(medians), float(robust_jitter(growth))) if medians else (0.0, 0.0)
 
 
 def _readout(
