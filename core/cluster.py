@@ -6,6 +6,7 @@ once, when its task has finished, and nothing is counted twice.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator, Sequence
 from types import TracebackType
 from typing import Any
@@ -14,8 +15,11 @@ from core.chunks import Chunk
 from core.errors import InputError
 from core.measurements import FrameMeasurement
 
-# Frames per task: long enough that finding the way in costs little, short enough to lose little.
+# Frames per task: long enough that finding the way in costs little, short enough that many workers share a clip. Few
+# workers have so many tasks each instead, none so long that much is lost with a worker.
 TASK_FRAMES = 240
+TASKS_EACH = 2
+MOST_TASK_FRAMES = 960
 # Times a task is run again when its worker has died.
 RETRIES = 3
 # Measures a chunk on whatever machine it runs; workers import it by name.
@@ -91,6 +95,7 @@ def longest_first(chunks: Sequence[Chunk]) -> list[Chunk]:
 
 
 def tasks_for(frames: int, workers: int) -> int:
-    """Return the number of tasks for a video: of some `TASK_FRAMES` each, and none that is left over at the end."""
-    tasks = max(1, -(-frames // TASK_FRAMES))
+    """Return the number of tasks for a video, none of which is left over at the end."""
+    share = frames / (TASKS_EACH * max(workers, 1))
+    tasks = max(1, math.ceil(frames / min(max(share, TASK_FRAMES), MOST_TASK_FRAMES)))
     return tasks if workers < 2 or tasks % workers == 0 or tasks < workers else -(-tasks // workers) * workers

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from core.chunks import LEAST_FRAMES, REPAYING_FRAMES, WARM_UP, Chunk, missing_chunks, processes_for
-from core.cluster import TASK_FRAMES, longest_first, tasks_for
+from core.cluster import MOST_TASK_FRAMES, longest_first, tasks_for
 from core.video import FrameIndex
 
 
@@ -75,16 +75,17 @@ def test_no_process_is_started_that_does_not_repay_it(frames, workers, cores, pr
 
 
 @pytest.mark.parametrize(
-    ("frames", "workers", "tasks"), [(1800, 800, 8), (900, 2, 4), (700, 2, 4), (100, 2, 1), (1, 0, 1)]
+    ("frames", "workers", "tasks"),
+    [(1800, 800, 8), (1800, 3, 6), (3000, 2, 4), (17160, 2, 18), (900, 2, 4), (700, 2, 4), (100, 2, 1), (1, 0, 1)],
 )
 def test_a_cluster_gets_tasks_of_a_size_that_leaves_no_worker_waiting(frames, workers, tasks):
     assert tasks_for(frames, workers) == tasks
-    assert frames / tasks_for(frames, workers) <= TASK_FRAMES
+    assert frames / tasks_for(frames, workers) <= MOST_TASK_FRAMES
 
 
 def test_workers_of_a_cluster_are_done_at_about_one_time():
     # A key frame in 150: chunks of 142 to 287 frames, which two workers take in turn as they are done.
-    chunks = missing_chunks([], index_of(3000, range(0, 3000, 150)), tasks_for(3000, 2))
+    chunks = missing_chunks([], index_of(3000, range(0, 3000, 150)), 14)
     given = longest_first(chunks)
     assert sorted(given, key=lambda chunk: chunk.start) == chunks
     busy_until = [0, 0]
