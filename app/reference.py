@@ -15,7 +15,7 @@ from app.context import Context
 from app.frames import Fingerprint, fingerprint
 from app.store import ProjectFolder
 from app.videos import video_info
-from core.coordinates import Floats, OrthoGrid
+from core.coordinates import Floats, OrthoGrid, is_in_frame
 from core.errors import InputError
 from core.georeference import ReferenceFit, fit_reference
 from core.lens import Lens, read_lens, require_image_size
@@ -50,18 +50,13 @@ def outside_frame(folder: ProjectFolder, project: Project, pairs: Sequence[Corre
         ApiError, InputError: the video or the lens cannot be used.
     """
     width, height = lens_of(folder, project)[0].image_size_px
-    beside = [str(pair.id) for pair in pairs if pair.enabled and not _is_in_frame(pair.frame_px, width, height)]
+    beside = [str(pair.id) for pair in pairs if pair.enabled and not is_in_frame(pair.frame_px, width, height)]
     if not beside:
         return ""
     frame = f"the {width} × {height} frame"
     if len(beside) == 1:
         return f"Pair {beside[0]} lies outside {frame}; move it, or switch it off."
     return f"Pairs {', '.join(beside)} lie outside {frame}; move them, or switch them off."
-
-
-def _is_in_frame(place_px: tuple[float, float], width: int, height: int) -> bool:
-    u, v = place_px
-    return -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5
 
 
 @lru_cache(maxsize=32)

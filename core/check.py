@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from core.cloud import Cloud, read_cloud
-from core.coordinates import Floats
+from core.coordinates import Floats, is_in_frame
 from core.drift import corner_obstacle
 from core.errors import InputError
 from core.georeference import ReferenceFit, fit_reference
@@ -188,18 +188,13 @@ def _correspondence_problems(project: Project, inputs: _Inputs) -> Iterator[str]
     if inputs.reference is not None and inputs.reference.contradiction and not inputs.reference.is_hopeless:
         yield inputs.reference.contradiction
     for pair in (pair for pair in project.correspondences if pair.enabled):
-        if inputs.info and not _within_frame(pair.frame_px, inputs.info):
+        if inputs.info and not is_in_frame(pair.frame_px, inputs.info.width, inputs.info.height):
             u, v = pair.frame_px
             size = f"{inputs.info.width} x {inputs.info.height}"
             yield f"correspondences: id {pair.id}: frame_px [{u:g}, {v:g}] is outside the {size} frame; click it again"
         if inputs.cloud and not _within_cloud(pair.ground_m, inputs.cloud):
             x, y = pair.ground_m
             yield f"correspondences: id {pair.id}: ground_m [{x:g}, {y:g}] lies outside the point cloud; click it again"
-
-
-def _within_frame(place_px: tuple[float, float], info: VideoInfo) -> bool:
-    u, v = place_px
-    return -0.5 <= u <= info.width - 0.5 and -0.5 <= v <= info.height - 0.5
 
 
 def _within_cloud(place_m: tuple[float, float], cloud: Cloud) -> bool:
@@ -229,7 +224,7 @@ def _target_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
                 yield f"{place}.{name}: [{x:g}, {y:g}] lies outside orthoimage.extent_m; move it or enlarge the extent"
             if inputs.reference and inputs.info:
                 u, v = inputs.reference.raw_from_plan(np.array([[x, y]]))[0]
-                if not _within_frame((float(u), float(v)), inputs.info):
+                if not is_in_frame((float(u), float(v)), inputs.info.width, inputs.info.height):
                     yield f"{place}.{name}: [{x:g}, {y:g}] appears outside the reference frame; move it"
 
 

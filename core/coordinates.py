@@ -32,6 +32,12 @@ def read_only(array: ArrayLike) -> Floats:
     return copy
 
 
+def is_in_frame(place_px: tuple[float, float], width: int, height: int) -> bool:
+    """Whether raw pixels lie on the frame, whose outermost pixels reach half a pixel beyond their centres."""
+    u, v = place_px
+    return -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5
+
+
 def apply_homography(H: ArrayLike, points: ArrayLike) -> Floats:
     """Map points through a homography.
 

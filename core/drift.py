@@ -21,6 +21,7 @@ from core.coordinates import Bools, Floats, read_only
 from core.errors import InputError
 from core.intervals import within
 from core.project import Intervals
+from core.words import with_minus_sign
 
 # The paper's range, in steps fine enough to see its knee.
 SWEEP_CORNERS_HZ = tuple((0.05 + 0.025 * np.arange(19)).round(3).tolist())
@@ -260,7 +261,7 @@ def _residual_warnings(
 
 def _centimetres(value_m: float) -> str:
     """Return a length in words, with a real minus sign, and none before zero."""
-    return f"{round(100 * value_m, 1) + 0.0:.1f} cm".replace("-", "\u2212")
+    return with_minus_sign(f"{round(100 * value_m, 1) + 0.0:.1f} cm")
 
 
 def _pre_event_warnings(after: Floats, times: Floats, intervals: Intervals, corner_hz: float) -> list[str]:

@@ -26,6 +26,7 @@ from core.intervals import within
 from core.project import Drift, Intervals
 from core.results import TargetHistory
 from core.validation import GpsComparison
+from core.words import with_minus_sign
 
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY, BLACK, GREY = (
     "#0072B2",
@@ -341,8 +342,7 @@ def gps_figure(
         _legend(error)
         for panel in (over, error):
             _shade(panel, intervals or Intervals(), named=panel is panels[0])
-    lag = f"{comparison.lag_s:.3f} s".replace("-", "\N{MINUS SIGN}")
-    panels[0].set_title(f"Video and GPS (clock lag {lag})")
+    panels[0].set_title(with_minus_sign(f"Video and GPS (clock lag {comparison.lag_s:.3f} s)"))
     _legend(panels[0])
     panels[3].set_xlabel("time, s")
     return figure

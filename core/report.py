@@ -18,6 +18,7 @@ from core.project import Project, Target
 from core.self_calibration import SUSPICIOUS
 from core.storage import write_atomically
 from core.validation import GpsComparison
+from core.words import with_minus_sign
 
 REPORT_FILE = "report.html"
 _LENS_WORDS = {
@@ -246,7 +247,7 @@ def _gps_table(gps: GpsComparison) -> str:
             _cm(row["video_m"]),
             _cm(row["gps_m"]),
             _cm(row["error_m"]),
-            "–" if row["error_percent"] is None else _signed(f"{row['error_percent']:z.1f}"),
+            "–" if row["error_percent"] is None else with_minus_sign(f"{row['error_percent']:z.1f}"),
             *([_cm(row["video_at_gps_m"]), _cm(row["error_at_gps_m"])] if gps.is_coarse else []),
         ]
         for row in gps.table()
@@ -350,8 +351,8 @@ def _reference_fit(fit: ReferenceFit | None) -> str:
 def _pair_row(pair: PairResidual) -> list[str]:
     return [
         f"{pair.id}" if pair.enabled else f"{pair.id} (off)",
-        *(_signed(f"{value:+z.2f}") for value in pair.residual_px),
-        *(_signed(f"{100 * value:+z.2f}") for value in pair.residual_m),
+        *(with_minus_sign(f"{value:+z.2f}") for value in pair.residual_px),
+        *(with_minus_sign(f"{100 * value:+z.2f}") for value in pair.residual_m),
         "–" if pair.left_out_px is None else f"{pair.left_out_px:.2f}",
         _cm(pair.left_out_m),
     ]
@@ -364,9 +365,9 @@ def _calibration(content: ReportContent) -> str:
     rows = [
         [
             correction.name,
-            _signed(correction.before),
-            _signed(correction.after),
-            _signed(f"{correction.in_priors:+z.2f}") + (" !" if abs(correction.in_priors) > SUSPICIOUS else ""),
+            with_minus_sign(correction.before),
+            with_minus_sign(correction.after),
+            with_minus_sign(f"{correction.in_priors:+z.2f}") + (" !" if abs(correction.in_priors) > SUSPICIOUS else ""),
         ]
         for correction in content.corrections
     ]
@@ -401,12 +402,7 @@ def _limitations(project: Project) -> list[str]:
 
 
 def _cm(value_m: float | None) -> str:
-    return "–" if value_m is None else _signed(f"{100 * value_m:z.2f}")
-
-
-def _signed(number: str) -> str:
-    """Return a number with the minus sign of the pages, in which a hyphen joins words."""
-    return number.replace("-", "−")
+    return "–" if value_m is None else with_minus_sign(f"{100 * value_m:z.2f}")
 
 
 def _section(title: str, *parts: str) -> str:

@@ -16,6 +16,7 @@ from pathlib import Path
 ORDER = (
     "version",
     "errors",
+    "words",
     "progress",
     "parallel",
     "coordinates",
