@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from core.camera import Pose, fit_poses, intersect_height, plan_homography, pose_from_homography, project
+from core.camera import Pose, fit_poses, intersect_height, jacobians, plan_homography, pose_from_homography, project
 from core.coordinates import Floats, apply_homography, invert_homography
 from core.errors import InputError
 from core.lens import Lens
@@ -22,9 +22,11 @@ COVERAGE_CELLS = 4
 # Standard deviations across the best line below which clicks count as collinear, as a part of their extent.
 COLLINEAR = 0.02
 # A click contradicts the others where it lies off their fit by more than this many metres, which no hand does, and by
-# this many times what is usual.
+# this many times what their own scatter allows; a few clicks scatter little by chance, but no hand is steadier than
+# CLICK_PX.
 CONTRADICTION_M = 0.3
 CONTRADICTION = 5.0
+CLICK_PX = 1.0
 # Beyond this the others are no use either, and search bands lie nowhere near their lines.
 HOPELESS_M = 5.0
 
@@ -37,6 +39,7 @@ class PairResidual:
         residual_px: clicked minus predicted place in the frame, undistorted pixels.
         residual_m: clicked minus predicted place on the ground, metres.
         left_out_px, left_out_m: size of the same when the pair takes no part in the fit; None where that cannot be fit.
+        left_out_sigma_px: what left_out_px may be by the scatter of the others, one standard deviation; likewise.
         predicted_raw: where the ground click should appear in the raw frame.
         predicted_m: where the frame click lies on the ground.
     """
@@ -47,6 +50,7 @@ class PairResidual:
     residual_m: tuple[float, float]
     left_out_px: float | None
     left_out_m: float | None
+    left_out_sigma_px: float | None
     predicted_raw: tuple[float, float]
     predicted_m: tuple[float, float]
 
@@ -76,14 +80,19 @@ class ReferenceFit:
 
     @property
     def contradiction(self) -> str | None:
-        """What is wrong with the pair that contradicts the others most, if one does; a sentence without its end."""
+        """What is wrong with the pair that contradicts the others most, or with all; a sentence without its end."""
         worst = self._contradicting
-        if worst is None:
-            return None
-        return (
-            f"correspondences: id {worst.id} lies {worst.left_out_m:.2f} m from where the others put it; click it "
-            "again or disable it"
-        )
+        if worst is not None:
+            return (
+                f"correspondences: id {worst.id} lies {worst.left_out_m:.2f} m from where the others put it; click it "
+                "again or disable it"
+            )
+        if self.rms_m > CONTRADICTION_M:
+            return (
+                f"correspondences: miss each other by {self.rms_m:.2f} m (RMS), and none stands out; look for several "
+                "mistaken ones, or a lens.yaml of another camera"
+            )
+        return None
 
     @property
     def is_hopeless(self) -> bool:
@@ -93,12 +102,13 @@ class ReferenceFit:
 
     @property
     def _contradicting(self) -> PairResidual | None:
-        known = [pair for pair in self.pairs if pair.enabled and pair.left_out_m is not None]
-        if len(known) < 5:
-            return None
-        off_m = np.array([pair.left_out_m for pair in known], dtype=np.float64)
-        worst = int(off_m.argmax())
-        return known[worst] if off_m[worst] > max(CONTRADICTION_M, CONTRADICTION * float(np.median(off_m))) else None
+        off = {
+            pair: pair.left_out_px / pair.left_out_sigma_px
+            for pair in self.pairs
+            if pair.enabled and pair.left_out_px and pair.left_out_sigma_px and (pair.left_out_m or 0) > CONTRADICTION_M
+        }
+        worst = max(off, key=off.__getitem__, default=None)
+        return None if worst is None or off[worst] < CONTRADICTION else worst
 
     def plan_from_raw(self, raw: Floats) -> Floats:
         """Return absolute plan metres (N, 2) of raw reference pixels (N, 2)."""
@@ -286,15 +296,30 @@ class _Model:
     H_plan_ray: Floats
     pose: Pose | None
 
-    def rays(self, point: Floats) -> Floats:
+    def rays(self, points: Floats) -> Floats:
         if self.pose is not None:
-            return project(self.pose.R, self.pose.centre_m, point[None])[0]
-        return apply_homography(invert_homography(self.H_plan_ray), point[None, :2])[0]
+            return project(self.pose.R, self.pose.centre_m, points)
+        return apply_homography(invert_homography(self.H_plan_ray), points[:, :2])
 
     def plan(self, ray: Floats, height_m: float) -> Floats:
         if self.pose is not None:
             return intersect_height(self.pose.R, self.pose.centre_m, ray[None], height_m)[0]
         return apply_homography(self.H_plan_ray, ray[None])[0]
+
+    @property
+    def unknowns(self) -> int:
+        """Of a pose, or of a homography."""
+        return 6 if self.pose is not None else 8
+
+    def derivatives(self, points: Floats) -> Floats:
+        """Return how rays of points (N, 3) change with the pose, (N, 2, 6), or with H_ray_plan's entries, (N, 2, 9)."""
+        if self.pose is not None:
+            return jacobians(self.pose.R[None], self.pose.centre_m[None], points)[1][0]
+        H = invert_homography(self.H_plan_ray)
+        plan = np.column_stack([points[:, :2], np.ones(len(points))])
+        ray, zero = self.rays(points), np.zeros_like(plan)
+        across = np.stack([np.hstack([plan, zero, -ray[:, :1] * plan]), np.hstack([zero, plan, -ray[:, 1:] * plan])], 1)
+        return np.asarray(across / (plan @ H[2])[:, None, None])
 
 
 def _fit(rays: Floats, points: Floats, has_lens: bool) -> _Model:
@@ -346,24 +371,58 @@ def _normalising(points: Floats) -> Floats:
     return np.array([[scale, 0.0, -scale * mean[0]], [0.0, scale, -scale * mean[1]], [0.0, 0.0, 1.0]])
 
 
-def _left_out(
-    rays: Floats, points: Floats, *, enabled: np.ndarray, lens: Lens, model: _Model
-) -> list[tuple[float, float] | None]:
-    """Return each pair's size of residual, pixels and metres, against the fit of the others; None where none is."""
+@dataclass(frozen=True)
+class _LeftOut:
+    """How far a pair lies from the fit of the others, and how far it may by their scatter (`PairResidual`)."""
+
+    px: float
+    m: float
+    sigma_px: float | None
+
+
+def _left_out(rays: Floats, points: Floats, *, enabled: np.ndarray, lens: Lens, model: _Model) -> list[_LeftOut | None]:
+    """Return each pair against the fit of the others; None where there is none.
+
+    Source: the externally studentised residual (Cook & Weisberg 1982, section 2.2.1): a pair that takes part in the fit
+    draws it to itself, and all others off it.
+    """
     others = enabled & ~np.eye(len(rays), dtype=bool)
     if model.pose is None:
         models = _models_without_poses(rays, points, others)
     else:
         models = _models_near(rays, points, others, model.pose)
-    errors: list[tuple[float, float] | None] = []
+    focal = float(lens.focal_px.mean())
+    errors: list[_LeftOut | None] = []
     for ray, point, chosen, without in zip(rays, points, others, models, strict=True):
         if without is None or not _determined(points[chosen, :2]):
             errors.append(None)
             continue
-        pixels = (ray - without.rays(point)) * lens.focal_px
+        pixels = (ray - without.rays(point[None])[0]) * lens.focal_px
         metres = point[:2] - without.plan(ray, point[2])
-        errors.append((float(np.linalg.norm(pixels)), float(np.linalg.norm(metres))))
+        sigma = _expected_error(without, rays[chosen], points[chosen], point, click=CLICK_PX / focal)
+        errors.append(
+            _LeftOut(
+                float(np.linalg.norm(pixels)), float(np.linalg.norm(metres)), None if sigma is None else sigma * focal
+            )
+        )
     return errors
+
+
+def _expected_error(model: _Model, rays: Floats, points: Floats, point: Floats, *, click: float) -> float | None:
+    """Return how far a further pair at `point` (3,) may lie off, in rays; None where all pairs are needed for the fit.
+
+    Args:
+        model: fitted to rays (N, 2) and points (N, 3).
+        click: standard deviation of one coordinate of a click by the steadiest hand, rays.
+    """
+    residual = rays - model.rays(points)
+    J, J_there = model.derivatives(points), model.derivatives(point[None])[0]
+    freedom = residual.size - model.unknowns
+    if freedom <= 0:
+        return None
+    variance = max(float((residual**2).sum()) / freedom, click**2)
+    covariance = np.linalg.pinv(np.einsum("nxu,nxv->uv", J, J), hermitian=True)
+    return float(np.sqrt(variance * np.trace(np.eye(2) + J_there @ covariance @ J_there.T)))
 
 
 def _determined(ground: Floats) -> bool:
@@ -401,9 +460,9 @@ def _pair_residual(
     model: _Model,
     lens: Lens,
     origin: Floats,
-    left_out: tuple[float, float] | None,
+    left_out: _LeftOut | None,
 ) -> PairResidual:
-    predicted_ray, predicted = model.rays(point), model.plan(ray, point[2])
+    predicted_ray, predicted = model.rays(point[None])[0], model.plan(ray, point[2])
     du, dv = (ray - predicted_ray) * lens.focal_px
     dx, dy = point[:2] - predicted
     u, v = lens.raw_from_rays(predicted_ray)
@@ -413,8 +472,9 @@ def _pair_residual(
         enabled=pair.enabled,
         residual_px=(float(du), float(dv)),
         residual_m=(float(dx), float(dy)),
-        left_out_px=None if left_out is None else left_out[0],
-        left_out_m=None if left_out is None else left_out[1],
+        left_out_px=None if left_out is None else left_out.px,
+        left_out_m=None if left_out is None else left_out.m,
+        left_out_sigma_px=None if left_out is None else left_out.sigma_px,
         predicted_raw=(float(u), float(v)),
         predicted_m=(float(x), float(y)),
     )

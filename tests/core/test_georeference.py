@@ -88,6 +88,34 @@ def test_a_click_that_contradicts_the_others_is_named(off_m: float) -> None:
     assert fit_reference(pairs, LENS).contradiction is None
 
 
+@pytest.mark.parametrize("wrong", range(6))
+def test_one_wrong_click_among_few_is_named_although_it_draws_the_fit_to_itself(wrong: int) -> None:
+    pairs = clicks(PLACES[[0, 3, 5, 7, 9, 10]], noise_px=0.7)
+    assert fit_reference(pairs, LENS).contradiction is None
+    x, y = pairs[wrong].ground_m
+    pairs[wrong] = pairs[wrong].model_copy(update={"ground_m": (x, y + 3.0)})
+    assert f"id {pairs[wrong].id} lies " in (fit_reference(pairs, LENS).contradiction or "")
+
+
+def test_clicks_by_an_unsteady_hand_contradict_each_other_but_none_is_blamed() -> None:
+    steady, unsteady = (fit_reference(clicks(noise_px=noise), LENS) for noise in (5.0, 20.0))
+    assert steady.contradiction is None
+    assert "miss each other by" in (unsteady.contradiction or "")
+    assert not unsteady.is_hopeless
+
+
+def test_a_left_out_click_lies_as_far_off_as_the_others_scatter() -> None:
+    fits = [fit_reference(clicks(noise_px=3.0, seed=seed), LENS) for seed in range(40)]
+    ratios = [
+        pair.left_out_px / pair.left_out_sigma_px
+        for fit in fits
+        for pair in fit.pairs
+        if pair.left_out_px is not None and pair.left_out_sigma_px is not None
+    ]
+    # Ten pairs less 6 unknowns leave 14 degrees of freedom, whose scatter widens the mean square by 14 / 12.
+    assert np.mean(np.square(ratios)) == pytest.approx(14 / 12, rel=0.15)
+
+
 def test_relief_below_the_clicks_is_taken_into_account() -> None:
     elevation = 0.3 * np.sin(np.arange(len(PLACES)))
     pairs = clicks(elevation_m=elevation)
