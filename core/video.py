@@ -39,6 +39,9 @@ READ_AHEAD = 6
 # A decoder's threads wait for each other and for whoever takes the frames: several for each core keep it busy.
 THREADS_PER_CORE = 3
 MOST_THREADS = 16
+# Pictures that tell whether a video is shown in another order than its times say: several times as many as any encoder
+# puts off.
+JUDGED_BY = 32
 # What is larger is a picture: its memory is the system's and not an arena's. What is smaller is needed again for the
 # next frame, so an arena keeps some of it. The other two are glibc's numbers for these settings.
 PICTURE_BYTES = 1 << 20
@@ -201,17 +204,35 @@ def _frame_index(path: File, state: FileState) -> FrameIndex:
             if packet.is_keyframe:
                 keys.append(packet.pts)
         tick_s = float(stream.time_base or 0)
+        reorders = stream.codec_context.has_b_frames
+    if reorders and ticks == sorted(ticks):
+        _require_times_as_shown(path)
     if first_key is not None:
         # A clip cut out of a longer one may begin with frames that need others from before the cut.
         ticks = [tick for tick in ticks if tick >= first_key]
     if not ticks:
-        raise InputError(f"{path}: its video stream holds no frames; export the video again.")
+        raise InputError(f"{path}: its video stream holds no frames that bear a time; export the video again as MP4.")
     if repeated := len(ticks) - len(set(ticks)):
         raise InputError(
             f"{path}: {repeated} of its {len(ticks)} frames bear the time of another; export the video again, with "
             "timestamps that increase from frame to frame."
         )
     return FrameIndex(ticks=tuple(sorted(ticks)), key_ticks=tuple(sorted(keys)), tick_s=tick_s)
+
+
+def _require_times_as_shown(path: File) -> None:
+    """Refuse a video whose pictures come out of the decoder, which puts them in order, with times that run backwards.
+
+    Raises:
+        InputError: its container knows only when frames are decoded.
+    """
+    with opened_video(path) as (container, stream):
+        shown = [picture.pts or 0 for picture in itertools.islice(decoded_pictures(container, stream), JUDGED_BY)]
+    if shown != sorted(shown):
+        raise InputError(
+            f"{path}: its frames bear the times at which they are decoded and not those at which they are shown, as "
+            "AVI files do; export the video again as MP4."
+        )
 
 
 class FramesAhead:

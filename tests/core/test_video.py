@@ -265,6 +265,12 @@ def test_frames_without_times_of_their_own(tmp_path: Path) -> None:
         frame_index(file)
 
 
+def test_times_of_decoding_are_not_taken_for_those_of_showing(tmp_path: Path) -> None:
+    """An AVI numbers its frames as they are decoded; where the encoder put some off, pictures would change places."""
+    with pytest.raises(InputError, match=r"v\.avi: its frames bear the times at which they are decoded .* as MP4\."):
+        frame_index(write(tmp_path / "v.avi"))
+
+
 def test_frames_beyond_the_end(video: Path) -> None:
     with pytest.raises(InputError, match="has 50 frames, so there is no frame 50"):
         list(read_frames(video, FRAMES))
