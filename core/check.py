@@ -21,6 +21,8 @@ from core.georeference import ReferenceFit, fit_reference
 from core.ground_plane import fit_ground_plane
 from core.intervals import within
 from core.lens import Lens, read_lens, require_image_size
+from core.measure import make_measurer
+from core.prediction import MeasureSetup
 from core.progress import Progress, silent
 from core.project import (
     LINE_NAMES,
@@ -61,7 +63,8 @@ def check_project(folder: Path, progress: Progress = silent, *, with_cloud: bool
     """Return each problem of a project folder, one line each with its remedy; none means that it can be measured.
 
     Args:
-        with_cloud: whether to read the point cloud too, which takes a minute for a large one.
+        with_cloud: whether to look at what takes a while too: the point cloud, a minute for a large one, and what the
+            reference frame shows in the search bands.
     """
     file = folder / PROJECT_FILE
     try:
@@ -73,6 +76,9 @@ def check_project(folder: Path, progress: Progress = silent, *, with_cloud: bool
     problems += [f"{file}: {problem}." for problem in obstacles(project, inputs.index, inputs.reference)]
     for check in (_video_problems, _correspondence_problems, _region_problems, _target_problems, _time_problems):
         problems += [f"{file}: {problem}." for problem in check(project, inputs)]
+    if with_cloud and not problems and inputs.reference is not None:
+        setup = MeasureSetup.of(project, file_at(folder, project.inputs.video), inputs.reference)
+        _tried(folder, problems, make_measurer, setup, None, inputs.index)
     return problems
 
 
@@ -99,6 +105,8 @@ def obstacles(project: Project, index: FrameIndex | None, reference: ReferenceFi
             obstacle = scale_obstacle(target, camera, has_lens=project.inputs.lens is not None)
         if obstacle is not None:
             yield f"targets[{number}].{obstacle}"
+        if target.lines is not None and target.kind == "lines":
+            yield from _line_obstacles(target.lines, f"targets[{number}]")
     if index is not None:
         yield from _time_obstacles(project, index)
 
@@ -134,12 +142,7 @@ def _read_inputs(
     folder: Path, project: Project, problems: list[str], progress: Progress, *, with_cloud: bool
 ) -> _Inputs:
     def tried(read: Callable[..., Result], *arguments: object) -> Result | None:
-        try:
-            with naming_file(folder):
-                return read(*arguments)
-        except InputError as error:
-            problems.append(str(error))
-            return None
+        return _tried(folder, problems, read, *arguments)
 
     given = project.inputs
     video = file_at(folder, given.video)
@@ -155,6 +158,16 @@ def _read_inputs(
         tried(read_gps, folder / given.gps.file, given.gps)
     reference = tried(_fit_reference, project, lens, info) if info and bool(lens) == bool(given.lens) else None
     return _Inputs(info=info, index=index, lens=lens, cloud=cloud, reference=reference)
+
+
+def _tried(folder: Path, problems: list[str], read: Callable[..., Result], *arguments: object) -> Result | None:
+    """Return what a function returns; None where it refuses, and its refusal is a problem more."""
+    try:
+        with naming_file(folder):
+            return read(*arguments)
+    except InputError as error:
+        problems.append(str(error))
+        return None
 
 
 def _require_ground(cloud: Cloud, project: Project, folder: Path) -> None:
@@ -216,8 +229,6 @@ def _overlaps_frame(region_px: Floats, info: VideoInfo) -> bool:
 def _target_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
     for number, target in enumerate(project.targets):
         place = f"targets[{number}]"
-        if target.lines is not None and target.kind == "lines":
-            yield from _line_problems(target.lines, place)
         for name, (x, y) in _corners(target):
             extent = project.orthoimage.extent_m
             if extent and not (extent[0] <= x <= extent[2] and extent[1] <= y <= extent[3]):
@@ -239,7 +250,7 @@ def _corners(target: Target) -> Iterator[tuple[str, tuple[float, float]]]:
             yield f"lines.{name}.to_m", band.to_m
 
 
-def _line_problems(lines: Lines, place: str) -> Iterator[str]:
+def _line_obstacles(lines: Lines, place: str) -> Iterator[str]:
     """Say where L1 and L2 do not cross T1 in two places well apart."""
     crossings = []
     for name, band in (("L1", lines.L1), ("L2", lines.L2)):

@@ -10,12 +10,13 @@ from functools import cached_property
 
 import numpy as np
 
-from core.coordinates import Floats, apply_homography
+from core.coordinates import Floats, apply_homography, invert_homography
 from core.errors import InputError
 from core.following import Apparent
+from core.georeference import ReferenceFit
 from core.lens import Lens
 from core.measurements import FrameMeasurement, Reference
-from core.project import Method, Target
+from core.project import Method, Project, Target
 from core.storage import File, content_identity
 
 # Raised whenever the same video would be measured differently: older recordings are then not continued.
@@ -41,6 +42,20 @@ class MeasureSetup:
     lens: Lens
     H_ray_plan: Floats
     origin_m: Floats
+
+    @classmethod
+    def of(cls, project: Project, video: File, fit: ReferenceFit) -> MeasureSetup:
+        """Return what a project asks of its video, looked for where the fit of the clicks says."""
+        return cls(
+            video=video,
+            reference_frame=project.reference_frame,
+            moving_regions_px=project.moving_regions_px,
+            targets=project.targets,
+            method=project.method,
+            lens=fit.lens,
+            H_ray_plan=invert_homography(fit.H_plan_ray),
+            origin_m=fit.origin_m,
+        )
 
     def rays_from_plan(self, plan_m: Floats) -> Floats:
         """Return rays (N, 2) of the reference frame at absolute plan metres (N, 2)."""

@@ -196,7 +196,7 @@ class Project(Model):
     @field_validator("targets")
     @classmethod
     def _targets_refer(cls, targets: tuple[Target, ...]) -> tuple[Target, ...]:
-        _refuse_twice("name", (target.name for target in targets))
+        _refuse_alike_names(targets)
         by_name = {target.name: target for target in targets}
         for target in targets:
             if target.relative_to is None:
@@ -211,6 +211,16 @@ class Project(Model):
     def is_excluded(self, frame: int) -> bool:
         """Whether a person rejected this frame."""
         return any(first <= frame <= last for first, last in self.excluded_frames)
+
+
+def _refuse_alike_names(targets: Iterable[Target]) -> None:
+    """Refuse names that differ by case only: their results would be one file on many disks."""
+    seen: dict[str, str] = {}
+    for target in targets:
+        name, other = target.name, seen.setdefault(target.name.casefold(), target.name)
+        if other != name:
+            raise ValueError(f'"{other}" and "{name}" differ by case only, as their files may not; rename one of them')
+    _refuse_twice("name", (target.name for target in targets))
 
 
 def _refuse_twice(what: str, values: Iterable[object]) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from core.check import obstacles
 from core.cloud import Cloud, read_cloud
-from core.coordinates import Floats, invert_homography
+from core.coordinates import Floats
 from core.errors import InputError
 from core.export import Results, write_results
 from core.georeference import ReferenceFit
@@ -75,17 +75,7 @@ class LoadedInputs:
 
     def setup(self) -> MeasureSetup:
         """Return what the pass over the video needs."""
-        fit = self.reference_fit
-        return MeasureSetup(
-            video=self.video,
-            reference_frame=self.project.reference_frame,
-            moving_regions_px=self.project.moving_regions_px,
-            targets=self.project.targets,
-            method=self.project.method,
-            lens=self.lens,
-            H_ray_plan=invert_homography(fit.H_plan_ray),
-            origin_m=fit.origin_m,
-        )
+        return MeasureSetup.of(self.project, self.video, self.reference_fit)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import av
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from core.lens import Lens, write_lens
 
@@ -16,14 +18,26 @@ FRAMES = 40
 RATE_HZ = 20
 
 
+def picture(size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
+    """Return rough ground, and in its middle a plain roof with three painted strips, (height, width, 3)."""
+    width, height = size
+    blots = np.random.default_rng(1).integers(0, 255, (height // 3, width // 3, 3), dtype=np.uint8)
+    shown = np.asarray(cv2.resize(blots, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+    roof = shown[height // 2 - 26 : height // 2 + 26, width // 2 - 26 : width // 2 + 26]
+    roof[:] = 60
+    for strip in (roof[18:21], roof[30:33], roof[:, 24:27]):
+        strip[:] = 220
+    return shown
+
+
 def write_video(file: Path, size: tuple[int, int] = SIZE, frames: int = FRAMES) -> None:
-    noise = np.random.default_rng(1).integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
+    shown = picture(size)
     with av.open(str(file), "w") as container:
         stream = container.add_stream("libx264", rate=RATE_HZ)
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p"
         for _ in range(frames):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(noise, format="rgb24")))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(shown, format="rgb24")))
         container.mux(stream.encode())
 
 
@@ -52,7 +66,7 @@ def document() -> dict[str, Any]:
         "name": "small",
         "inputs": {"video": "video.mp4", "cloud": "site.csv", "lens": "lens.yaml", "gps": {"file": "gps.csv"}},
         "correspondences": pairs,
-        "moving_regions_px": [[[60, 40], [100, 40], [100, 80], [60, 80]]],
+        "moving_regions_px": [[[52, 32], [108, 32], [108, 88], [52, 88]]],
         "targets": [
             {
                 "name": "roof",

@@ -15,6 +15,7 @@ from core.check import check_project
 from core.drift import corner_obstacle, high_pass
 from core.errors import InputError
 from core.lens import Lens, write_lens
+from core.run import run_project
 from tests import small_project
 
 IN_A_LINE = [{"id": i, "ground_m": [i, 0], "frame_px": [i, i * i]} for i in range(5)]
@@ -80,7 +81,7 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
         (put(None, "targets", 0, "height_m"), 'targets[0].height_m: missing, but method "geometric" needs'),
         (put([-8, -8, 8, 1], "orthoimage", "extent_m"), "targets[0].lines.T1.to_m: [0, 2] lies outside orthoimage"),
         (put([0, 9.5], "targets", 0, "lines", "T1", "to_m"), "T1.to_m: [0, 9.5] appears outside the reference frame"),
-        (put([2, -0.2], "targets", 0, "lines", "T1", "from_m"), None),
+        (put([0.2, -2], "targets", 0, "lines", "T1", "from_m"), None),
         (put([-2, 1.9], "targets", 0, "lines", "T1", "from_m"), "L1 and T1 run nearly the same way"),
         (put([1.0, 5.0], "intervals_s", "residual"), "intervals_s.residual: [1, 5] reaches outside the video"),
         (put([0.51, 0.54], "intervals_s", "pre_event"), "intervals_s.pre_event: [0.51, 0.54] holds no frame"),
@@ -99,6 +100,11 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
         (put("3.0", "targets", 0, "height_m"), 'targets[0].height_m: input should be a valid number, not "3.0"'),
         (put(True, "reference_frame"), "reference_frame: input should be a valid integer, not true"),
         (put(3, "wind"), 'wind: unknown key "wind"'),
+        (
+            put({"from_m": [-2, 4], "to_m": [2, 4]}, "targets", 0, "lines", "L1"),
+            "targets.roof.lines.L1 ",
+        ),
+        (put([[[-9, -9], [170, -9], [170, 130], [-9, 130]]], "moving_regions_px"), "leave only 0 ground features"),
     ],
 )
 def test_each_contradiction_is_told_in_one_line(inputs: Path, change: Change, told: str | None) -> None:
@@ -162,6 +168,22 @@ def test_l1_and_l2_in_the_same_place(inputs: Path) -> None:
     band = small_project.document()["targets"][0]["lines"]["L1"]
     (line,) = problems(inputs, put(band, "targets", 0, "lines", "L2"))
     assert "L1 and L2 cross T1 in the same place" in line
+
+
+def test_names_that_differ_by_case_only(inputs: Path) -> None:
+    roof = small_project.document()["targets"][0]
+    (line,) = problems(inputs, put([roof, {**roof, "name": "ROOF"}], "targets"))
+    assert 'targets: "roof" and "ROOF" differ by case only, as their files may not; rename one of them' in line
+
+
+def test_lines_that_cross_nowhere_are_not_measured_either(inputs: Path) -> None:
+    """Whoever does not check first would get P1 and P2 kilometres apart."""
+    lines = small_project.document()["targets"][0]["lines"]
+    change = put({"L1": lines["L1"], "L2": lines["T1"], "T1": lines["L2"]}, "targets", 0, "lines")
+    (line,) = problems(inputs, change)
+    with pytest.raises(InputError, match="L1 and T1 run nearly the same way") as refusal:
+        run_project(inputs)
+    assert str(refusal.value) == line
 
 
 def test_paper_needs_neither_lens_nor_height(inputs: Path) -> None:
