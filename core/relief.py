@@ -67,6 +67,12 @@ class Relief:
             shown &= self._of_cell(top, places) < height
         return np.asarray(shown, dtype=np.bool_)
 
+    def stands_at(self, xy_m: Floats) -> float | None:
+        """Return how high above the datum lies what stands at most of some places (N, 2); None where nothing does."""
+        heights = self._of_cell(self.standing_m, xy_m)
+        standing = heights[heights != 0.0]
+        return float(np.median(standing)) if 2 * len(standing) > len(heights) else None
+
     def _of_cell(self, raster: Floats, xy_m: Floats) -> Floats:
         """Return the value (N,) of the cell in which each place (N, 2) lies; 0 beyond the raster."""
         return np.asarray(map_coordinates(raster, self._places(xy_m), order=0, mode="grid-constant", cval=0.0))

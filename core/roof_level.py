@@ -1,6 +1,7 @@
 """What lifts the ground's metres to a target: its height above the ground, or the known distance P1–P2.
 
-An obstacle is said from the target's key in `project.json` on: what is wrong with it and what to do.
+An obstacle is said from the target's key in `project.json` on: what is wrong with it and what to do. A doubt keeps
+nothing from being measured; it is a sentence for whoever uses the result.
 """
 
 from __future__ import annotations
@@ -11,6 +12,9 @@ from core.camera import Pose
 from core.coordinates import Floats
 from core.errors import InputError
 from core.project import PROJECT_FILE, Target
+
+# How far scales at the roof may lie from each other: wrong by more are height, lens or bands, not the measurement.
+SCALE_TOLERANCE = 0.02
 
 
 def height_obstacle(target: Target, camera: Pose | None) -> str | None:
@@ -54,6 +58,41 @@ def _too_high(height_m: float, camera: Pose | None) -> str | None:
     return (
         f"height_m: {height_m:g}, but by the clicks the camera hovers {camera.centre_m[2]:.1f} m above the ground; "
         "correct the height, the clicks or the lens"
+    )
+
+
+def distance_doubt(target: Target, places_m: Floats, *, height_m: float | None) -> str | None:
+    """Return what makes a target's known distance P1–P2 doubtful, or None.
+
+    Args:
+        places_m: (2, 2) P1 and P2 at that height, world metres.
+        height_m: of the target, as calibrated; None where it is not known.
+    """
+    if target.p1_p2_m is None or height_m is None or target.kind != "lines":
+        return None
+    distance_m = float(np.linalg.norm(places_m[0] - places_m[1]))
+    if abs(distance_m / target.p1_p2_m - 1.0) <= SCALE_TOLERANCE:
+        return None
+    return (
+        f"P1 and P2 of {target.name} lie {distance_m:.3f} m apart where it is {height_m:.2f} m high, but p1_p2_m is "
+        f"{target.p1_p2_m:.3f} m; check height_m, the lens and the bands."
+    )
+
+
+def height_doubt(target: Target, shown_m: float | None, camera: Pose | None) -> str | None:
+    """Return what makes a target's height doubtful, or None.
+
+    Args:
+        shown_m: height above the ground of what the point cloud shows where the target is; None where it shows nothing.
+        camera: of the reference frame.
+    """
+    if shown_m is None or target.height_m is None or camera is None:
+        return None
+    if abs(shown_m - target.height_m) <= SCALE_TOLERANCE * (camera.centre_m[2] - target.height_m):
+        return None
+    return (
+        f"height_m of {target.name} is {target.height_m:.2f} m, but the point cloud shows it {shown_m:.2f} m above the "
+        "ground; check height_m and orthoimage.ground_z_m."
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from core.bodies import RestBody, midpoints, rest_body, world_points
 from core.calibration import Calibration, Evidence, calibrate, calibration_sigma
 from core.camera import fit_poses, plan_homographies
-from core.coordinates import Floats, evenly_spread
+from core.coordinates import Bools, Floats, evenly_spread, finite_rows
 from core.flight import SmoothFlight, smooth_flight
 from core.georeference import ReferenceFit
 from core.ground_poses import fit_with_relief, solve_ground
@@ -25,22 +25,22 @@ from core.motion import RigidFit
 from core.project import Project, Target
 from core.relief import Relief
 from core.results import MEASURED, TargetHistory
-from core.roof_level import height_obstacle, refuse_if, scale_at_roof
+from core.roof_level import distance_doubt, height_doubt, height_obstacle, refuse_if, scale_at_roof
 from core.row_times import Readout, at_frame_times, estimated_readout, ground_speed
 from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution, TargetSolution, frame_status
-from core.uncertainty import GROUND_PART, Sigma, combined_sigma, common_error, jitter, robust_jitter
+from core.uncertainty import GROUND_PART, LEAST_STILL, Sigma, combined_sigma, common_error, jitter, robust_jitter
 
 # Frames from which a rolling shutter is estimated.
 READOUT_FRAMES = 150
 # Change of the readout by which its effect is found, seconds: moves no point by more than a few pixels.
 READOUT_STEP_S = 1e-3
-# How far P1 and P2 may lie from their known distance: wrong by more are height, lens or bands, not the measurement.
-DISTANCE_TOLERANCE = 0.02
 # A building that moves by more than this in its pre-event, metres, and by so many times the noise, is not at rest or
 # not where it is thought to be.
 UNREST_M = 2e-3
 UNREST = 3.0
+# A building that moves by more than this after the event has not come to rest: the published residual is as exact.
+UNREST_AFTER_M = 0.01
 # No building grows. A target that does so from one second to another by more than this part of itself, and by so many
 # times the noise of a frame, tells that focal length or focus changed. (In rendered clips without, it is 0.04 %, or in
 # noisy ones five times the noise; where the lens zooms by 1 %, which costs 14 mm, it is 0.8 %.)
@@ -101,39 +101,68 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
         self_calibration=calibration,
         flight=flight,
         readout=readout,
-        warnings=(*calibration.warnings, *_warnings(project, targets, used.heights_m)),
+        warnings=(
+            *calibration.warnings,
+            *_doubts(recording, project, used, origin_m=reference.origin_m, relief=relief),
+            *_unrest(project, targets),
+        ),
     )
 
 
-def _warnings(project: Project, targets: Mapping[str, TargetSolution], heights_m: Mapping[str, float]) -> Iterator[str]:
-    """Say what about the targets cannot be right."""
+def _doubts(
+    recording: Recording, project: Project, used: Calibration, *, origin_m: Floats, relief: Relief | None
+) -> Iterator[str]:
+    """Say what about heights and distances cannot be right."""
     for target in project.targets:
-        solved = targets[target.name]
-        distance_m = float(np.linalg.norm(np.subtract(*solved.rest_m)))
-        given_m = target.p1_p2_m
-        if given_m is not None and target.kind == "lines" and abs(distance_m / given_m - 1.0) > DISTANCE_TOLERANCE:
-            yield (
-                f"P1 and P2 of {target.name} lie {distance_m:.3f} m apart where it is {heights_m[target.name]:.2f} m "
-                f"high, but p1_p2_m is {given_m:.3f} m; check height_m, the lens and the bands."
-            )
-        still = during(solved.history.time_s, project.intervals_s.pre_event) & solved.history.measured
-        if project.intervals_s.pre_event is not None and not still.any():
+        height_m = used.heights_m[target.name]
+        body = rest_body(recording, target.name, lens=used.lens, pose0=used.pose0, z_m=height_m)
+        at_rest = body.stations if body.points is None else body.points
+        assert at_rest is not None
+        shown_m = None if relief is None else relief.stands_at(at_rest[finite_rows(at_rest)] + origin_m)
+        doubts = distance_doubt(target, body.places, height_m=height_m), height_doubt(target, shown_m, used.pose0)
+        yield from (doubt for doubt in doubts if doubt is not None)
+
+
+def _unrest(project: Project, targets: Mapping[str, TargetSolution]) -> Iterator[str]:
+    """Say what moves or changes that should not, and where there is too little to tell."""
+    for target in project.targets:
+        history, intervals = targets[target.name].history, project.intervals_s
+        still = during(history.time_s, intervals.pre_event) & history.measured
+        if intervals.pre_event is not None and not still.any():
             yield (
                 f"{target.name} was not measured in pre_event, so its displacement counts from the reference frame; "
                 "choose another pre_event."
             )
-        moved_m = float(solved.history.p1_m[still].std(axis=0).max()) if still.any() else 0.0
-        if moved_m > max(UNREST_M, UNREST * float(jitter(solved.history.p1_m[still]).max())):
+        elif intervals.pre_event is not None and still.sum() < LEAST_STILL:
+            yield (
+                f"{target.name} was measured in only {still.sum()} frames of pre_event, which tell neither its rest "
+                "nor its noise well; choose a longer pre_event."
+            )
+        moved_m = _movement(history, still)
+        if moved_m > UNREST_M:
             yield (
                 f"P1 of {target.name} moves by {1e3 * moved_m:.1f} mm (RMS) in pre_event, steadily and not as noise: "
                 "it shakes there already, or height_m, the lens or the clicks are wrong."
             )
-        growth, noise = _largest_growth(solved)
+        moved_m = _movement(history, during(history.time_s, intervals.residual) & history.measured)
+        if moved_m > UNREST_AFTER_M:
+            yield (
+                f"P1 of {target.name} moves by {1e3 * moved_m:.1f} mm (RMS) in residual: it shakes there still, so "
+                "their mean is no residual displacement; choose a later residual."
+            )
+        growth, noise = _largest_growth(targets[target.name])
         if growth > max(MOST_GROWTH, GROWTH_NOISE * noise):
             yield (
                 f"{target.name} seems to grow or shrink by {100 * growth:.1f} % during the clip, as if the camera had "
                 "zoomed or refocused, so its displacement is wrong; film with focal length and focus held fixed."
             )
+
+
+def _movement(history: TargetHistory, frames: Bools) -> float:
+    """Return how much P1 moves in some measured frames (F,), RMS along its livelier axis; 0 where it is noise."""
+    places = history.p1_m[frames]
+    moved_m = float(places.std(axis=0).max()) if len(places) else 0.0
+    return moved_m if moved_m > UNREST * float(jitter(places).max()) else 0.0
 
 
 def _largest_growth(solved: TargetSolution) -> tuple[float, float]:

@@ -5,6 +5,8 @@ Source: the paper, "UAV Drift and Perspective Correction", "Roof Feature Detecti
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from core.camera import intersect_height
@@ -19,7 +21,7 @@ from core.motion import regress_lines
 from core.project import Project, Target
 from core.relief import Relief
 from core.results import TargetHistory
-from core.roof_level import refuse_if, scale_at_roof, scale_obstacle
+from core.roof_level import distance_doubt, height_doubt, refuse_if, scale_at_roof, scale_obstacle
 from core.solution import Ground, Solution, TargetSolution, frame_status
 from core.uncertainty import GROUND_PART, held_to_jitter
 
@@ -51,8 +53,23 @@ def solve_paper(
         self_calibration=None,
         readout=None,
         flight=None,
-        warnings=(),
+        warnings=tuple(_doubts(recording, project, reference, relief)),
     )
+
+
+def _doubts(recording: Recording, project: Project, reference: ReferenceFit, relief: Relief | None) -> Iterator[str]:
+    """Say what about heights and distances cannot be right, where the camera's place tells it."""
+    for target in project.targets:
+        if target.height_m is None or reference.pose is None:
+            continue
+        raw = recording.reference.targets_raw[target.name].mean(axis=-2)[None]
+        plan = plan_points(raw, reference.lens, reference.H_plan_ray[None])
+        lines = regress_lines(plan)
+        places = _rest(target, reference, np.stack([lines.intersection(0, 2)[0], lines.intersection(1, 2)[0]]))
+        at_rest = _rest(target, reference, plan[finite_rows(plan)]) + reference.origin_m
+        shown_m = None if relief is None else relief.stands_at(at_rest)
+        doubts = distance_doubt(target, places, height_m=target.height_m), height_doubt(target, shown_m, reference.pose)
+        yield from (doubt for doubt in doubts if doubt is not None)
 
 
 def stabilise(recording: Recording, lens: Lens, H_plan_ray0: Floats) -> Ground:

@@ -51,6 +51,15 @@ def test_ground_is_shown_where_nothing_stands() -> None:
     assert shown((-1.8, 4.2, 0.0)) == [True]
 
 
+def test_what_stands_at_a_place_has_a_height() -> None:
+    def stands_at(*places: tuple[float, float]) -> float | None:
+        return site().stands_at(np.array(places) + SITE_M)
+
+    assert stands_at((3.5, 0.0), (4.0, 0.5), (9.0, 9.0)) == pytest.approx(2.0 + 0.01 * 4, abs=0.02)
+    assert stands_at((-8.0, 3.0), (9.0, -9.0), (4.0, 0.5)) is None
+    assert stands_at((30.0, 0.0)) is None
+
+
 def test_no_ground_is_shown_on_things_behind_them_and_in_pits() -> None:
     on_top, in_the_pit = (4.0, 0.5, 2.0), (-5.0, -5.0, -1.0)
     assert shown(on_top, in_the_pit) == [False, False]

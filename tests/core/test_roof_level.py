@@ -6,7 +6,14 @@ import pytest
 from core.camera import Pose
 from core.errors import InputError
 from core.project import Band, Lines, Target
-from core.roof_level import height_obstacle, refuse_if, scale_at_roof, scale_obstacle
+from core.roof_level import (
+    distance_doubt,
+    height_doubt,
+    height_obstacle,
+    refuse_if,
+    scale_at_roof,
+    scale_obstacle,
+)
 
 BAND = Band(from_m=(0.0, 0.0), to_m=(1.0, 0.0))
 CAMERA = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 40.0]))
@@ -48,3 +55,18 @@ def test_an_obstacle_is_refused_with_its_place() -> None:
 def test_a_roof_half_way_to_the_camera_appears_twice_as_large() -> None:
     assert scale_at_roof(roof(), PLACES_M, height_m=20.0, camera=CAMERA) == pytest.approx(0.5)
     assert scale_at_roof(roof(p1_p2_m=1.2), PLACES_M, height_m=20.0, camera=CAMERA) == pytest.approx(0.6)
+
+
+def test_a_height_is_doubted_where_the_cloud_shows_another() -> None:
+    """Two percent of what lies between roof and camera, 20 m here, are two percent of every displacement."""
+    assert height_doubt(roof(height_m=20.0), 20.35, CAMERA) is None
+    assert height_doubt(roof(height_m=20.0), None, CAMERA) is None
+    told = height_doubt(roof(height_m=20.0), 21.0, CAMERA)
+    assert "height_m of roof is 20.00 m, but the point cloud shows it 21.00 m above the ground" in (told or "")
+
+
+def test_a_distance_is_doubted_that_the_height_does_not_give() -> None:
+    assert distance_doubt(roof(p1_p2_m=1.97), PLACES_M, height_m=20.0) is None
+    assert distance_doubt(roof(), PLACES_M, height_m=20.0) is None
+    told = distance_doubt(roof(p1_p2_m=1.8), PLACES_M, height_m=20.0)
+    assert "P1 and P2 of roof lie 2.000 m apart where it is 20.00 m high, but p1_p2_m is 1.800 m" in (told or "")

@@ -189,6 +189,31 @@ def test_a_zoom_in_mid_clip_is_told_by_a_roof_that_seems_to_grow(kind: str) -> N
     assert not any("grow" in words for words in solved(steady, **changes).warnings)
 
 
+def test_a_residual_in_which_the_building_shakes_is_told() -> None:
+    recording = scene.recording(NOISE_PX)
+    assert not any("residual" in warning for warning in solved(recording).warnings)
+    shaken = solved(recording, intervals_s={"pre_event": [0.0, 2.9], "event": [3.0, 4.0], "residual": [3.5, 5.0]})
+    assert any("P1 of roof moves by" in told and "choose a later residual" in told for told in shaken.warnings)
+
+
+def test_a_pre_event_of_a_few_frames_is_told() -> None:
+    told = solved(scene.recording(NOISE_PX), intervals_s={"pre_event": [0.0, 0.2]}).warnings
+    assert any("roof was measured in only" in warning and "choose a longer pre_event" in warning for warning in told)
+
+
+def test_a_height_that_the_cloud_does_not_show_is_told() -> None:
+    recording, document = scene.recording(NOISE_PX), scene.project_document()
+    west, south = scene.SITE_M - 30.0
+    x, y = np.meshgrid(west + 0.25 * np.arange(240), south + 0.25 * np.arange(240))
+    middle = scene.SITE_M + scene.ROOF_M
+    on_roof = (np.abs(x - middle[0]) < 4.0) & (np.abs(y - middle[1]) < 4.0)
+    for wrong_by_m in (0.0, 1.0):
+        standing = np.where(on_roof, scene.HEIGHT_M + wrong_by_m, 0.0)
+        relief = Relief(float(west), float(south), 0.25, np.zeros(x.shape), standing)
+        warnings = solve_geometric(recording, document, scene.LENS, relief).warnings
+        assert any("but the point cloud shows it" in warning for warning in warnings) == (wrong_by_m > 0)
+
+
 def test_a_pre_event_in_which_nothing_was_measured_is_told() -> None:
     recording = scene.recording(NOISE_PX)
     roof = recording.targets_raw["roof"].copy()
