@@ -371,6 +371,9 @@ def _decoded(
 ) -> Iterator[tuple[int, VideoFrame]]:
     """Yield numbers and pictures of what can be decoded of frames `start` to `stop`.
 
+    A decoder tells of damage before it yields a key frame that it holds back; the number that is then missing tells of
+    it once more.
+
     Raises:
         InputError: there is no such frame, the file cannot be read on, or pictures of another size begin in it.
     """
@@ -382,11 +385,16 @@ def _decoded(
         size = stream.width, stream.height
         if start > 0:
             _seek(container, stream, index, start)
+        whole, expected = True, len(index)
         for picture in decoded_pictures(container, stream):
             number = index.number_at(picture.pts)
-            if number is not None and stop is not None and number >= stop:
+            if number is None:
+                continue
+            whole = picture.key_frame or (whole and number <= expected)
+            expected = number + 1
+            if stop is not None and number >= stop:
                 return
-            if number is not None and number >= start:
+            if number >= start and whole:
                 if (picture.width, picture.height) != size:
                     raise InputError(
                         f"{path}: frame {number} ({index.time_s_of(number):.2f} s) is {picture.width} x "
@@ -396,16 +404,25 @@ def _decoded(
 
 
 def decoded_pictures(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
-    """Yield all pictures from where a video stands on; what is damaged is left out.
+    """Yield all pictures from where a video stands on; what is damaged, or builds on what is, is left out.
+
+    Pictures between key frames are told by what changed since others. Where one of those is missing, a decoder takes
+    what it has instead, and the picture is that of another moment or drifts away.
 
     Raises:
         InputError: the file cannot be read on.
     """
+    whole = True
     for packet in _packets(container, stream):
         try:
-            yield from packet.decode()
+            pictures = packet.decode()
         except av.error.InvalidDataError:
+            whole = False
             continue
+        for picture in pictures:
+            whole = (whole or picture.key_frame) and not picture.is_corrupt
+            if whole:
+                yield picture
 
 
 def _packets(container: InputContainer, stream: VideoStream) -> Iterator[av.Packet[VideoStream]]:

@@ -291,13 +291,30 @@ def test_frames_behind_a_damaged_one_keep_their_numbers(tmp_path: Path, codec: s
     frames = list(read_frames(file))
     numbers = [frame.index for frame in frames]
     missing = set(range(FRAMES)) - set(numbers)
-    # A key frame takes with it what is decoded from it.
-    assert 0 < len(missing) <= 12
+    # A key frame takes with it what is decoded from it, pictures shown just before it among them.
+    assert 0 < len(missing) <= 12 + 3
     assert [number_of(frame.luma) for frame in frames[-8:]] == numbers[-8:] == list(range(FRAMES - 8, FRAMES))
     np.testing.assert_allclose([frame.time_s for frame in frames], np.array(numbers) / 25, atol=1e-9)
     assert [frame.index for frame in read_frames(file, 3)] == numbers[3 - len([n for n in missing if n < 3]) :]
     with pytest.raises(InputError, match=f"frame {min(missing)} cannot be decoded; choose another"):
         read_frame(file, min(missing))
+
+
+@pytest.mark.parametrize("damaged", [12, 13, 27])
+@pytest.mark.parametrize("seed", range(3))
+def test_pictures_that_build_on_a_damaged_one_are_left_out(tmp_path: Path, damaged: int, seed: int) -> None:
+    """A decoder that misses a picture takes another in its place, and shows an earlier moment as if it were now."""
+    whole = write(tmp_path / "whole.mp4", options={"bf": "0", "x264-params": "scenecut=0"})
+    noise = np.random.default_rng(seed)
+
+    def edit(number: int, data: bytes) -> bytes:
+        third = len(data) // 3
+        return data[:third] + noise.bytes(len(data) - third) if number == damaged else data
+
+    shown = {frame.index: frame.luma for frame in read_frames(repacked(whole, tmp_path / "damaged.mp4", edit))}
+    truth = {frame.index: frame.luma for frame in read_frames(whole)}
+    assert all((truth[number] == luma).all() for number, luma in shown.items())
+    assert set(truth) - set(shown) <= set(range(damaged, 12 * (damaged // 12 + 1)))
 
 
 @pytest.mark.parametrize(
