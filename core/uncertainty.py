@@ -63,7 +63,8 @@ def common_error(residual: Floats, time_s: Floats, still: Bools) -> Floats:
         own = _mean_where_mostly_seen(own.reshape(frames, rows, PIECES, count // PIECES))
     square = finite_median(np.abs(own).reshape(frames, -1)) ** 2
     window = max(1, round(AVERAGED_S / float(np.median(np.diff(time_s))))) if frames > 1 else 1
-    wandering = BY_MEDIAN * np.sqrt(uniform_filter1d(square, window, mode="nearest"))
+    # A running sum keeps, of what has left it, a rounding error of either sign.
+    wandering = BY_MEDIAN * np.sqrt(np.maximum(uniform_filter1d(square, window, mode="nearest"), 0.0))
     at_rest = max(float(np.median(wandering[usual])), 1e-12)
     return np.asarray(at_rest * np.maximum(wandering / at_rest, LEAST_WANDERING) ** GROWTH)
 

@@ -136,3 +136,13 @@ def test_what_target_and_base_share_is_no_error_of_their_difference() -> None:
     np.testing.assert_allclose(held.p2_sigma_m[held.measured, 1], 1e-4, rtol=0.2)
     np.testing.assert_allclose(held.rotation_sigma_rad[held.measured], 3e-4)
     assert held_to_scatter(relative, np.arange(FRAMES) < LEAST_STILL - 1) is relative
+
+
+@pytest.mark.filterwarnings("error")
+def test_frames_behind_lost_ones_and_a_rough_one_still_have_a_common_error() -> None:
+    residual = np.full((200, 1, 16), np.nan)
+    residual[:60] = np.random.default_rng(3).normal(size=(60, 1, 16))
+    residual[59] *= 1e3
+    found = common_error(residual, np.arange(200) / 30.0, np.arange(200) < 50)
+    assert np.isfinite(found).all()
+    assert (found > 0).all()
