@@ -232,7 +232,7 @@ class Outcomes:
         if recorded.frames < 2:
             raise NotYet("Nothing has been measured yet with these bands and regions; track first.", path="track")
         wanted = by_method(project, chosen)
-        alike = (folder.id, chosen, recorded, _but_filter(wanted), _stamps(folder, project))
+        alike = (folder.id, chosen, recorded, _but_filter(wanted), input_stamps(folder, project))
         with self._one_at_a_time(folder.id):
             with self._lock:
                 kept = {key: found for key, found in self._solved.items() if key[0] == alike}
@@ -380,12 +380,14 @@ def _but_filter(project: Project) -> str:
     return project_json(project.model_copy(update={"name": "-", "drift": Drift()}))
 
 
-def _stamps(folder: ProjectFolder, project: Project) -> tuple[Any, ...]:
-    stamps: list[Any] = []
-    for kind in ("video", "cloud", "lens", "gps"):
-        try:
-            path = folder.input_file(kind, project)
-            stamps.append(None if path is None else fingerprint(path))
-        except (InputError, ApiError):
-            stamps.append(None)
-    return tuple(stamps)
+def input_stamps(folder: ProjectFolder, project: Project) -> tuple[Fingerprint | None, ...]:
+    """Return what changes with any input of a project."""
+    return tuple(_stamp(folder, project, kind) for kind in stored_inputs(project.inputs))
+
+
+def _stamp(folder: ProjectFolder, project: Project, kind: str) -> Fingerprint | None:
+    try:
+        file = folder.input_file(kind, project)
+        return None if file is None else fingerprint(file)
+    except (InputError, ApiError):
+        return None

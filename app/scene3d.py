@@ -87,6 +87,7 @@ class _Shown:
     keys: dict[str, Any] = field(default_factory=dict)
     nodes: dict[str, list[Any]] = field(default_factory=dict)
     visible: dict[str, bool] = field(default_factory=dict)
+    points: int = 0
 
 
 @cache
@@ -128,6 +129,11 @@ class Scene3D:
     def origin_m(self) -> Floats:
         """(3,) world place that is the scene's origin."""
         return self._shown.origin_m
+
+    @property
+    def points(self) -> int:
+        """How many points of the cloud are drawn."""
+        return self._shown.points
 
     @contextlib.contextmanager
     def turn(self, project: str, *, take: bool) -> Iterator[bool]:
@@ -204,6 +210,7 @@ class Scene3D:
                     point_shape="square",
                 )
             )
+        self._shown.points = len(view.points_m)
 
     def set_ground(self, view: GroundView, key: Any) -> None:
         """Show the fitted ground plane, with what it is and how far the ground strays from it in words."""

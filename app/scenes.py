@@ -75,7 +75,8 @@ def _show(here: Context, folder: ProjectFolder, view: View) -> dict[str, Any]:
         return _nothing("There is no point cloud to show; choose one in the inputs.")
     origin = site.cloud.origin_m if site is not None else np.array([*_origin_of(fit), 0.0])
     here.scene.open(folder.id, origin, lambda start, along: _picked(here, folder, start, along))
-    shown = _show_site(here, folder, site, view) if site is not None else 0
+    if site is not None:
+        _show_site(here, folder, site, view)
     if fit is not None and fit.pose is not None:
         _show_flight(here, folder, project, site=site, fit=fit, view=view)
     else:
@@ -83,7 +84,7 @@ def _show(here: Context, folder: ProjectFolder, view: View) -> dict[str, Any]:
         here.scene.drop("lines")
     here.scene.show(view.show or {})
     total = len(site.cloud) if site is not None else 0
-    return {"ready": True, "points_shown": shown, "points_total": total, "message": problem}
+    return {"ready": True, "points_shown": here.scene.points, "points_total": total, "message": problem}
 
 
 def _nothing(message: str) -> dict[str, Any]:
@@ -101,23 +102,20 @@ def _origin_of(fit: ReferenceFit | None) -> list[float]:
     return [0.0, 0.0] if fit is None else fit.origin_m.tolist()
 
 
-def _show_site(here: Context, folder: ProjectFolder, site: Site, view: View) -> int:
+def _show_site(here: Context, folder: ProjectFolder, site: Site, view: View) -> None:
     count = max(1000, min(view.points, MAX_POINTS))
     key = (site.key, count, view.colour)
-    shown = min(count, len(site.cloud))
     if not here.scene.has("cloud", key):
         thinned = thin(site.cloud, count)
         span = np.ptp(thinned.points_m[:, :2], axis=0)
         spacing = float(np.sqrt(max(span[0] * span[1], 1e-6) / len(thinned)))
         colours = _colours(thinned, site, view.colour)
         here.scene.set_cloud(CloudView(thinned.points_m.astype(np.float32), colours, spacing), key)
-        shown = len(thinned)
         lowest, highest = site.cloud.extent_m
         here.scene.look(np.array(site.plane.at_m), float(np.max(highest - lowest)) * 0.6)
     if not here.scene.has("ground", site.key):
         here.scene.set_ground(_ground(site), site.key)
     _show_orthoimage(here, folder, site)
-    return shown
 
 
 def _colours(cloud: Cloud, site: Site, wanted: Colour) -> NDArray[np.uint8]:

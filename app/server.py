@@ -158,14 +158,17 @@ def _add_pages(app: FastAPI) -> None:
         return RedirectResponse(f"/p/{quote(project_id, safe='')}/{step}")
 
     @app.get("/p/{project_id}/{step}")
-    def page(project_id: str, step: str, here: Here, request: Request) -> FileResponse:
-        """Return the page of a step; to people it says itself that its project is not there."""
+    def page(project_id: str, step: str, here: Here, request: Request) -> Response:
+        """Return the page of a step; people with a wrong address are led to one, which says if there is no project."""
+        is_person = "text/html" in request.headers.get("accept", "")
         if step not in STEPS:
+            if is_person:
+                return RedirectResponse(f"/p/{quote(project_id, safe='')}")
             raise Missing(f"{step}: there is no such page.", path=step)
         try:
             here.workspace.open(project_id)
         except Missing:
-            if "text/html" not in request.headers.get("accept", ""):
+            if not is_person:
                 raise
             return _page(step, status_code=404)
         return _page(step)

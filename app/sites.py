@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from app.errors import ApiError, NotYet
+from app.errors import ApiError, Busy, NotYet
 from app.frames import Fingerprint, fingerprint
 from app.jobs import Jobs
 from app.store import CACHE_FOLDER, ProjectFolder, read_json
@@ -145,7 +145,8 @@ class Sites:
             raise InputError(
                 f"{path.name}: {latest.message} It is read anew when the page of the inputs is loaded again."
             )
-        self._jobs.start(folder, "cloud", order)
+        with contextlib.suppress(Busy):  # another question began it this very moment
+            self._jobs.start(folder, "cloud", order)
 
 
 def site_key(path: Path, project: Project) -> str:

@@ -251,7 +251,7 @@ def _export(seen: _Look) -> Step:
 
 
 def _problems(folder: ProjectFolder, project: Project, look: bool) -> list[str] | None:
-    key = (str(folder.folder), project_json(project), _stamps(folder, project))
+    key = (str(folder.folder), project_json(project), outcome.input_stamps(folder, project))
     if look and key not in _known_problems:
         place = f"{folder.folder}{os.sep}"
         found = [problem.replace(place, "") for problem in check_project(folder.folder, with_cloud=False)]
@@ -261,15 +261,3 @@ def _problems(folder: ProjectFolder, project: Project, look: bool) -> list[str] 
             _known_problems.pop(next(iter(_known_problems)), None)
         _known_problems[key] = found
     return _known_problems.get(key)
-
-
-def _stamps(folder: ProjectFolder, project: Project) -> tuple[Any, ...]:
-    """Return what changes with any input."""
-    stamps = []
-    for file in stored_inputs(project.inputs).values():
-        try:
-            state = (folder.folder / file).stat() if file else None
-        except OSError:
-            state = None
-        stamps.append((state.st_size, state.st_mtime_ns) if state else None)
-    return tuple(stamps)

@@ -41,6 +41,7 @@ BLUE, ORANGE, GREEN, RED, PURPLE, SKY, BLACK, GREY = (
 AXIS_COLOURS = (BLUE, RED)
 LINE_COLOURS = {"L1": SKY, "L2": ORANGE, "T1": PURPLE}
 PAGE_WIDTH_IN = 7.2  # an A4 page between its margins
+HALF_PAGE_IN = (PAGE_WIDTH_IN / 2, 3.0)  # two of these lie side by side; none is so high that a page stays half empty
 
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib, so that every computer draws the same
@@ -125,27 +126,25 @@ def target_figures(
         antenna_m: (F, 2) the displacement that was compared with GPS; that of P1 where not given.
     """
     raw_m = history.p1_raw_m
-    drawn = {
-        "displacement": history_figure(history, intervals, {"unfiltered, at the paper's scale": raw_m}),
-        "orbit": orbit_figure(history),
-    }
+    drawn = {"displacement": history_figure(history, intervals, {"unfiltered, at the paper's scale": raw_m})}
+    if comparison is not None:
+        moved = history.p1_m if antenna_m is None else antenna_m
+        drawn["gps"] = gps_figure(history.time_s, moved, comparison, intervals)
     resting = within(history.time_s, intervals.pre_event)
     if intervals.pre_event is not None and np.isfinite(raw_m[resting]).all(axis=1).sum() >= 4:
         spectrum = amplitude_spectrum(raw_m, history.time_s, intervals.pre_event)
         drawn["pre_event"] = pre_event_figure(history.time_s[resting], raw_m[resting], spectrum)
-        # A clip too short for any corner of the sweep has no such figure.
-        with suppress(InputError):
-            sweep = corner_sweep(raw_m, history.time_s, intervals.pre_event, order=drift.order)
-            drawn["corner_sweep"] = corner_sweep_figure(sweep, drift.corner_hz)
+        # A clip too short for any corner of the sweep has no such figures.
         with suppress(InputError):
             corners = sorted({0.1, drift.corner_hz, 0.5})
             filtered = {hz: high_pass(raw_m[:, 0], history.time_s, hz, drift.order) for hz in corners}
             drawn["corner_effect"] = corner_effect_figure(
                 history.time_s, raw_m[:, 0], filtered, intervals=intervals, comparison=comparison
             )
-    if comparison is not None:
-        moved = history.p1_m if antenna_m is None else antenna_m
-        drawn["gps"] = gps_figure(history.time_s, moved, comparison, intervals)
+        with suppress(InputError):
+            sweep = corner_sweep(raw_m, history.time_s, intervals.pre_event, order=drift.order)
+            drawn["corner_sweep"] = corner_sweep_figure(sweep, drift.corner_hz)
+    drawn["orbit"] = orbit_figure(history)
     return drawn
 
 
@@ -162,7 +161,7 @@ def history_figure(
         intervals: shaded and named.
         also_m: other displacements of P1 to lay over it, name -> (F, 2), such as raw or another method's.
     """
-    figure, axes = _stacked(3, height_in=6.4)
+    figure, axes = _stacked(3, height_in=4.8)
     others = {name: np.asarray(values, dtype=np.float64) for name, values in (also_m or {}).items()}
     for axis in (0, 1):
         drawn = [history.p1_m[:, axis], *(values[:, axis] for values in others.values())]
@@ -215,7 +214,7 @@ def pre_event_figure(
     Source: the paper's Fig. 7.
     """
     times, moved = np.asarray(time_s, dtype=np.float64), np.asarray(displacement_m, dtype=np.float64)
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 4.2), layout="constrained")
+    figure = Figure(figsize=(PAGE_WIDTH_IN, 3.4), layout="constrained")
     panels = figure.subplots(2, 2, sharex="col", width_ratios=(3, 2))
     scale, unit = length_unit(moved)
     shown = (spectrum.frequency_hz > 0) & (spectrum.frequency_hz <= highest_hz)
@@ -246,7 +245,7 @@ def corner_sweep_figure(sweep: CornerSweep, chosen_hz: float | None = None) -> F
 
     Source: the paper's Fig. 8.
     """
-    figure = Figure(figsize=(PAGE_WIDTH_IN * 0.62, 3.0), layout="constrained")
+    figure = Figure(figsize=HALF_PAGE_IN, layout="constrained")
     axes = figure.subplots()
     scale, unit = length_unit(sweep.rms_m)
     for axis, marker in zip((0, 1), "os", strict=True):
@@ -288,7 +287,7 @@ def corner_effect_figure(
     Source: the paper's Fig. 9.
     """
     times, unfiltered = np.asarray(time_s, dtype=np.float64), np.asarray(unfiltered_m, dtype=np.float64)
-    figure, panels = _stacked(2, height_in=4.8, share=False)
+    figure, panels = _stacked(2, height_in=3.8, share=False)
     named = (("Before the event", intervals.pre_event), ("During the event", intervals.event))
     for panel, (title, interval) in zip(panels, named, strict=True):
         chosen = within(times, interval)
@@ -324,10 +323,10 @@ def gps_figure(
     Source: the paper's Fig. 11.
     """
     times, moved = np.asarray(time_s, dtype=np.float64), np.asarray(displacement_m, dtype=np.float64)
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 7.0), layout="constrained")
-    panels = figure.subplots(4, 1, sharex=True, height_ratios=(3, 2, 3, 2))
+    figure = Figure(figsize=(PAGE_WIDTH_IN, 3.8), layout="constrained")
+    panels = figure.subplots(2, 2, sharex=True, height_ratios=(3, 2))
     for axis in (0, 1):
-        over, error = panels[2 * axis], panels[2 * axis + 1]
+        over, error = panels[:, axis]
         scale, unit = length_unit(moved[:, axis])
         over.plot(
             comparison.time_s, scale * comparison.gps_m[:, axis], color=BLACK, lw=0, marker=".", ms=3, label="GPS"
@@ -341,17 +340,17 @@ def gps_figure(
         error.set_ylabel(f"error, {unit}")
         _legend(error)
         for panel in (over, error):
-            _shade(panel, intervals or Intervals(), named=panel is panels[0])
-    panels[0].set_title(with_minus_sign(f"Video and GPS (clock lag {comparison.lag_s:.3f} s)"))
-    _legend(panels[0])
-    panels[3].set_xlabel("time, s")
+            _shade(panel, intervals or Intervals(), named=panel is over)
+        error.set_xlabel("time, s")
+    panels[0, 0].set_title(with_minus_sign(f"Video and GPS (clock lag {comparison.lag_s:.3f} s)"))
+    _legend(panels[0, 1])
     return figure
 
 
 @styled
 def orbit_figure(history: TargetHistory) -> Figure:
     """Draw the path of P1 in plan, coloured by time, with north up and one scale for both axes."""
-    figure = Figure(figsize=(PAGE_WIDTH_IN * 0.62, 4.0), layout="constrained")
+    figure = Figure(figsize=HALF_PAGE_IN, layout="constrained")
     axes = figure.subplots()
     scale, unit = length_unit(history.p1_m)
     x, y = scale * history.p1_m[history.measured].T
@@ -378,7 +377,7 @@ def camera_figure(time_s: ArrayLike, centre_m: ArrayLike, roll_pitch_yaw_rad: Ar
     known = np.isfinite(centre).all(axis=1)
     drift_m = centre - (centre[known].mean(axis=0) if known.any() else 0.0)
     turns = None if roll_pitch_yaw_rad is None else np.degrees(np.asarray(roll_pitch_yaw_rad, dtype=np.float64))
-    figure = Figure(figsize=(PAGE_WIDTH_IN, 3.2 if turns is None else 4.6), layout="constrained")
+    figure = Figure(figsize=(PAGE_WIDTH_IN, 3.0 if turns is None else 3.6), layout="constrained")
     grid = figure.add_gridspec(1 if turns is None else 2, 2, width_ratios=(3, 2))
     history = figure.add_subplot(grid[0, 0])
     plan = figure.add_subplot(grid[:, 1])
@@ -426,8 +425,8 @@ def frame_figure(
     """
     lines = {name: np.asarray(points, dtype=np.float64).reshape(-1, 2) for name, points in lines_px.items()}
     height, width = image.shape[:2]
-    # As high as the whole frame needs, and half an inch for the names.
-    height_in = min(0.59 * PAGE_WIDTH_IN * height / width, 6.0) + 0.5
+    # As high as the whole frame needs, and a little for the names.
+    height_in = min(0.59 * PAGE_WIDTH_IN * height / width, 5.0) + 0.3
     figure = Figure(figsize=(PAGE_WIDTH_IN, height_in), layout="constrained")
     whole, roof = figure.subplots(1, 2, width_ratios=(3, 2))
     for panel in (whole, roof):
@@ -444,7 +443,7 @@ def frame_figure(
     _enlarge(roof, lines, (width, height))
     whole.set_title(title)
     if lines:
-        roof.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=5, handlelength=1.2, columnspacing=1.0)
+        _legend(roof)
     return figure
 
 

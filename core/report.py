@@ -136,11 +136,11 @@ def report_html(content: ReportContent, made_on: date | None = None) -> str:
         ),
         _section("Inputs", _inputs(content)),
         _section("Method", _method(content.project), _settings(content.project)),
+        _section("Limitations", _list(_limitations(content.project))),
         _section("Reference frame", _reference_fit(content.reference_fit)),
         _section("Ground registration", _facts(content.ground)) if content.ground else "",
         _section("Self-calibration", _calibration(content)),
         _section("Camera", *map(_figure, content.figures)) if content.figures else "",
-        _section("Limitations", _list(_limitations(content.project))),
     ]
     return _PAGE.format(
         title=escape(content.project.name), style=_STYLE, head=_head(content, made_on), body="".join(sections)
@@ -432,39 +432,41 @@ def _figure(figure: ReportFigure) -> str:
     data = base64.b64encode(figure.png).decode("ascii")
     caption = escape(figure.caption)
     return (
-        f'<figure><img src="data:image/png;base64,{data}" alt="{caption}" style="width: {100 * figure.width:.0f}%">'
+        f'<figure style="width: {100 * figure.width:.0f}%"><img src="data:image/png;base64,{data}" alt="{caption}">'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 
 
 _STYLE = """
-@page { size: A4; margin: 18mm 16mm;
+@page { margin: 15mm 16mm;
   @bottom-left { content: "Rooftrack, displacement report"; font: 8pt sans-serif; color: #555; }
   @bottom-right { content: "page " counter(page) " of " counter(pages); font: 8pt sans-serif; color: #555; } }
-body { font: 10pt/1.45 "Segoe UI", "Helvetica Neue", Arial, "DejaVu Sans", sans-serif; color: #1a1a1a; background: #fff;
-  max-width: 178mm; margin: 12mm auto; padding: 0 6mm; counter-reset: figure; }
+body { font: 9.5pt/1.4 "Segoe UI", "Helvetica Neue", Arial, "DejaVu Sans", sans-serif; color: #1a1a1a; background: #fff;
+  max-width: 178mm; margin: 12mm auto; padding: 0 6mm; counter-reset: figure;
+  orphans: 1; widows: 1; }
 .kind { font-size: 10pt; color: #555; margin: 0; }
 h1 { font-size: 20pt; margin: 0 0 1mm; }
-h2 { font-size: 13pt; margin: 9mm 0 2mm; border-bottom: 0.3mm solid #bbb; padding-bottom: 1mm; break-after: avoid; }
-h3 { font-size: 11pt; margin: 5mm 0 2mm; break-after: avoid; }
-h4 { font-size: 10pt; margin: 4mm 0 1mm; break-after: avoid; }
+h2 { font-size: 13pt; margin: 6mm 0 2mm; border-bottom: 0.3mm solid #bbb; padding-bottom: 1mm; break-after: avoid; }
+h3 { font-size: 11pt; margin: 4mm 0 1mm; break-after: avoid; }
+h4 { font-size: 10pt; margin: 3mm 0 1mm; break-after: avoid; }
 table { border-collapse: collapse; width: 100%; font-size: 8.5pt; margin: 2mm 0; }
 thead { display: table-header-group; }
-tr, figure, dl, li { break-inside: avoid; }
+tr, figure, dd, li { break-inside: avoid; }
+p { margin: 2mm 0; }
+p, li { orphans: 2; widows: 2; }
 th { text-align: left; font-weight: 600; border-bottom: 0.3mm solid #666; vertical-align: bottom; }
-th, td { padding: 0.8mm 1.5mm; }
+th, td { padding: 0.6mm 1.5mm; }
 td { border-bottom: 0.15mm solid #ddd; overflow-wrap: anywhere; }
 .number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 th.number { white-space: normal; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.6mm 5mm; margin: 2mm 0; font-size: 9pt; }
 dt { color: #555; }
 dd { margin: 0; overflow-wrap: anywhere; }
-figure { margin: 4mm 0; }
-img { max-width: 100%; }
-figure { counter-increment: figure; }
-figcaption { font-size: 8.5pt; color: #444; }
+figure { display: inline-block; margin: 3mm 0 0; vertical-align: top; counter-increment: figure; }
+img { width: 100%; }
+figcaption { font-size: 8.5pt; color: #444; padding-right: 3mm; }
 figcaption::before { content: "Figure " counter(figure) ". "; font-weight: 600; }
-@media print { body { margin: 0; padding: 0; max-width: none; } }
+@media print { body { margin: 0 auto; padding: 0; } }
 """
 _PAGE = """<!doctype html>
 <html lang="en">

@@ -77,6 +77,13 @@ def test_what_is_not_there_has_the_one_shape(client: TestClient, path: str) -> N
     assert_shape(answer, path)
 
 
+def test_a_person_with_a_wrong_address_is_led_to_the_project(client: TestClient) -> None:
+    wrong = "/p/small/no-such-step"
+    led = client.get(wrong, headers={"Accept": "text/html"}, follow_redirects=False)
+    assert (led.status_code, led.headers["location"]) == (307, "/p/small")
+    assert client.get(wrong).status_code == 404
+
+
 def test_a_method_that_does_not_exist_has_the_one_shape(client: TestClient) -> None:
     assert_shape(client.patch("/api/projects"), "PATCH")
 

@@ -231,6 +231,21 @@ def test_a_cloud_is_read_beside_the_server_and_known_from_then_on(
     assert client.get(f"{SMALL}/orthoimage").json()["stale"]
 
 
+def test_a_cloud_asked_for_twice_at_once_is_read_once_and_no_error(
+    client: TestClient, context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert client.get(f"{SMALL}/inputs").json()["cloud"]["reading"]
+    known, asked = context.jobs.running, []
+
+    def not_yet_heard_of(project: str, kind: str) -> Any:
+        asked.append(kind)
+        return None if len(asked) == 1 else known(project, kind)
+
+    monkeypatch.setattr(context.jobs, "running", not_yet_heard_of)
+    assert client.get(f"{SMALL}/inputs").json()["cloud"]["reading"]
+    assert len(asked) > 1
+
+
 def test_inputs_that_cannot_be_used_are_told_one_by_one(client: TestClient, workspace: Path) -> None:
     (workspace / "small" / "video.mp4").write_bytes(b"no video")
     (workspace / "small" / "lens.yaml").write_text("%YAML:1.0\nimage_width: 4\n")

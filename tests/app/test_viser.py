@@ -184,6 +184,8 @@ def test_a_click_in_the_scene_tells_the_tabs_the_height(
     assert shown["ready"]
     assert 500 < shown["points_shown"] <= 1000
     assert shown["points_total"] == 6400
+    again = client.post(f"{small}/scene", json={"points": 1000}).json()
+    assert again["points_shown"] == shown["points_shown"]  # as many as are drawn, not as many as were asked for
     told: list[Any] = []
     context.hub.publish = lambda project, event, data: told.append((event, data))  # type: ignore[method-assign]
 

@@ -62,8 +62,10 @@ def chromium() -> Iterator[Browser]:
     path = next((found for name in CHROMIUM_NAMES if (found := shutil.which(name))), None)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=CHROMIUM_OPTIONS)
-        yield browser
-        browser.close()
+        try:
+            yield browser
+        finally:
+            browser.close()
 
 
 @contextlib.contextmanager
@@ -80,8 +82,10 @@ def watched(browser: Browser, address: str, **options: Any) -> Iterator[Page]:
     page.on(
         "response", lambda answer: troubles.append(f"{answer.status} {answer.url}") if answer.status >= 500 else None
     )
-    yield page
-    context.close()
+    try:
+        yield page
+    finally:
+        context.close()  # a scene that a failed test leaves open would draw on and slow all tests after it
     assert troubles == []
 
 

@@ -154,19 +154,42 @@ def test_nudges_done_again_are_still_one_step_of_undo(browser, project):
         eventually(lambda: read_project(folder).correspondences[2].frame_px == before)
 
 
-def test_edits_of_a_tab_that_gets_no_answer_are_done_again(browser, project):
+def test_edits_wait_in_the_window_for_a_server_that_does_not_answer(browser, project):
     folder, pages = project
     with watched(browser, pages) as page:
         page.goto(f"{pages}/correspondences")
         ready(page, "Reference frame")
-        page.route(of_project(pages), lambda route: route.abort())
-        page.get_by_role("checkbox", name="Pair 4 counts").click()
-        expect(page.get_by_role("alert")).to_contain_text("does not answer")
-        page.unroute(of_project(pages))
-        page.get_by_role("button", name="Do it again").click()
-        expect(page.get_by_role("checkbox", name="Pair 4 counts")).not_to_be_checked()
+        asked: list[str] = []
+        page.on("dialog", lambda dialog: (asked.append(dialog.type), dialog.dismiss()))
+        page.context.set_offline(True)
+        for pair in (4, 5):
+            page.get_by_role("checkbox", name=f"Pair {pair} counts").click()
+        expect(page.get_by_text("The server does not answer – trying again; your edits wait here")).to_be_visible()
+        expect(page.locator(".save-state")).to_have_text("Not saved yet")
+        for pair in (4, 5):
+            expect(page.get_by_role("checkbox", name=f"Pair {pair} counts")).not_to_be_checked()
+        to_step(page, "Regions")
+        assert arrived(page, asked) == "beforeunload"
+        page.context.set_offline(False)
         saved(page)
-    assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [4]
+        expect(page.get_by_text("The server does not answer – trying again")).to_be_hidden()
+        expect(page.locator("#fit .figures")).to_contain_text("18 / 20")
+    assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [4, 5]
+
+
+def test_an_edit_whose_answer_is_lost_on_its_way_is_made_once(browser, project):
+    folder, pages = project
+    u, v = read_project(folder).correspondences[2].frame_px
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences?pair=3")
+        ready(page, "Reference frame")
+        pane(page, "Reference frame").focus()
+        page.route(of_project(pages), lambda route: (route.fetch(), route.abort()), times=1)
+        page.keyboard.press("ArrowRight")
+        expect(page.locator(".save-state")).to_have_attribute("data-state", "waiting")
+        saved(page)
+        expect(page.get_by_role("alert")).to_have_count(0)
+    assert read_project(folder).correspondences[2].frame_px == (pytest.approx(u + 0.1), v)
 
 
 def test_a_wrong_edit_takes_none_behind_it_along(browser, project):
@@ -678,6 +701,10 @@ def test_an_upload_that_is_cancelled_leaves_nothing(browser, project, tmp_path):
             video.get_by_role("button", name="Upload…").click()
         chooser.value.set_files(large)
         expect(video.locator(".job .numbers")).to_contain_text("MB/s")
+        asked: list[str] = []
+        page.on("dialog", lambda dialog: (asked.append(dialog.type), dialog.dismiss()))
+        to_step(page, "Track")
+        assert arrived(page, asked) == "beforeunload"
         video.get_by_role("button", name="Cancel").click()
         expect(video.locator(".job")).to_have_count(0)
         expect(video.locator(".badge")).to_have_text("understood")

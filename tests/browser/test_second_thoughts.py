@@ -27,6 +27,25 @@ def test_messages_add_no_scrollbar_and_do_not_pile_up(browser, project):
         assert page.evaluate("document.documentElement.scrollHeight") == page.evaluate("innerHeight")
 
 
+def test_a_message_takes_no_click_from_what_lies_below_it(browser, project):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        page.evaluate(
+            """async () => (await import("/static/js/components/toast.js")).toast("A word.", { seconds: 0 })"""
+        )
+        words, menu = page.locator(".toast"), page.get_by_role("button", name="Import and export")
+        over, under = words.bounding_box(), menu.bounding_box()
+        assert over["x"] < under["x"] + under["width"] / 2 < over["x"] + over["width"]
+        assert over["y"] < under["y"] + under["height"] / 2 < over["y"] + over["height"]
+        menu.click()
+        expect(page.get_by_role("menuitem", name="Import")).to_be_visible()
+        page.keyboard.press("Escape")
+        words.get_by_role("button", name="Dismiss").click()
+        expect(words).to_have_count(0)
+
+
 def click_share(page: Page, share: tuple[float, float]) -> None:
     """Click the whole reference frame at a share of its width and height."""
     lies = fitted(page, pane(page, "Reference frame"), FRAME_SIZE)
@@ -349,3 +368,35 @@ def test_two_targets_never_share_a_result_file(browser, project):
         expect(page.locator(".toast")).to_contain_text("would share a result file")
         expect(page.locator("#targets li[data-target=table]")).to_be_visible()
     assert [target.name for target in read_project(folder).targets] == ["roof"]
+
+
+def test_a_very_long_name_leaves_room_for_the_rest(browser, project):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    name = "A name that tells everything about the project. " * 10
+    (folder / "project.json").write_text(json.dumps(document | {"name": name.strip()}))
+    with watched(browser, pages) as page:
+        page.goto(pages.split("/p/")[0])
+        title = page.locator(f"[data-project='{folder.name}'] h2")
+        expect(title).to_have_attribute("title", name.strip())
+        assert title.bounding_box()["height"] < 50
+        page.goto(f"{pages}/track")
+        expect(page.locator(".project-name")).to_have_attribute("title", name.strip())
+        assert page.locator("#header").bounding_box()["height"] < 60
+
+
+def test_a_click_beside_a_dialog_throws_away_nothing_that_was_entered(browser, project):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(pages.split("/p/")[0])
+        page.get_by_role("button", name="New project").first.click()
+        name = page.get_by_label("Name", exact=True)
+        name.fill("EQ7")
+        page.mouse.click(5, 5)
+        expect(name).to_have_value("EQ7")
+        page.keyboard.press("Escape")
+        expect(page.get_by_role("dialog")).to_have_count(0)
+        page.get_by_role("button", name="Keys and gestures").click()
+        expect(page.get_by_role("dialog")).to_be_visible()
+        page.mouse.click(5, 5)  # nothing to lose in a list of keys
+        expect(page.get_by_role("dialog")).to_have_count(0)

@@ -10,7 +10,7 @@ from playwright.sync_api import Page, expect
 
 from core.project import read_project
 from core.results import read_history_csv
-from tests.browser.live import ask, eventually, free_port, serving, watched
+from tests.browser.live import SAMPLE, ask, eventually, free_port, serving, watched
 from tests.browser.steps import ready, saved
 
 FRAMES = 600
@@ -172,3 +172,14 @@ def test_in_a_narrow_window_two_wide_pictures_lie_one_above_the_other(browser, p
         page.get_by_role("button", name="Frame", exact=True).or_(page.get_by_role("radio", name="Frame")).first.click()
         alone, stage = page.locator("#frame").bounding_box(), page.locator(".stage-body").bounding_box()
         assert alone["height"] == stage["height"]
+
+
+def test_a_damaged_cloud_is_told_without_the_way_to_it(browser, project):
+    folder, pages = project
+    (folder / "cut.laz").write_bytes((SAMPLE / "site.laz").read_bytes()[:1_000_000])
+    change(folder, inputs=json.loads((folder / "project.json").read_text())["inputs"] | {"cloud": "cut.laz"})
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/orthoimage?view=picture")
+        words = page.locator("#ground .note")
+        expect(words).to_contain_text("cut.laz: is damaged")
+        expect(words).not_to_contain_text(str(folder))

@@ -135,9 +135,10 @@ def test_curves_carry_the_numbers_in_the_unit_of_the_label() -> None:
 
 def test_gps_error_panel_names_its_rms() -> None:
     figure = FIGURES["gps"]()
-    legend = figure.axes[1].get_legend()
-    assert legend is not None
-    assert legend.get_texts()[0].get_text().startswith("RMS ")
+    for error in figure.axes[2:]:
+        legend = error.get_legend()
+        assert legend is not None
+        assert legend.get_texts()[0].get_text().startswith("RMS ")
     assert "clock lag 4.000 s" in figure.axes[0].get_title(loc="left")
 
 
@@ -168,3 +169,11 @@ def test_style_is_the_houses_and_leaves_the_process_alone() -> None:
 )
 def test_people_read_millimetres_or_centimetres(values_m: list[float], unit: tuple[float, str]) -> None:
     assert figures.length_unit(values_m) == unit
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_two_figures_fit_on_a_page(name: str) -> None:
+    """Else what does not fit below another leaves half a page empty: Letter is the shorter paper."""
+    page_in, caption_in = 11.0 - 2 * 15 / 25.4, 0.25
+    shown = 178 / 25.4 / figures.PAGE_WIDTH_IN  # of the width drawn for, as the report prints it
+    assert 2 * (shown * FIGURES[name]().get_figheight() + caption_in) < page_in + 0.05

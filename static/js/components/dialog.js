@@ -1,4 +1,5 @@
-// Modal dialogs on the browser's own <dialog>: focus stays inside, Escape closes, focus returns.
+// Modal dialogs on the browser's own <dialog>: focus stays inside, Escape closes, focus returns. A click beside one
+// closes it only where nothing can be filled in: what a person entered is not thrown away by a slip of the hand.
 
 import { h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
@@ -35,7 +36,9 @@ export function openDialog({ title, body, size = "" }) {
       ...body(close).filter((child) => child instanceof Node),
     );
     dialog.addEventListener("cancel", (event) => (event.preventDefault(), close(null)));
-    dialog.addEventListener("pointerdown", (event) => event.target === dialog && close(null));
+    dialog.addEventListener("pointerdown", (event) => {
+      if (event.target === dialog && dialog.querySelector("input, select, textarea") === null) close(null);
+    });
     document.body.append(dialog);
     dialog.showModal();
     const first = dialog.querySelector("[autofocus], .dialog-body input, .dialog-body select, .dialog-body button");

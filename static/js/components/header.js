@@ -121,17 +121,22 @@ export function projectHeader(store, step, events) {
   ]);
 }
 
-/** A bar below the header while the server does not answer. @param {import("../lib/events.js").ServerEventStream} events */
-export function tellConnection(events) {
-  const bar = h(
-    "p",
-    { class: "connection-bar", role: "status", hidden: true },
-    icon("warn", "small"),
-    "The server does not answer – trying again",
-  );
+/** A bar below the header while the server does not answer. @param {import("../lib/events.js").ServerEventStream} events @param {ProjectStore} store */
+export function tellConnection(events, store) {
+  const words = h("span");
+  const bar = h("p", { class: "connection-bar", role: "status", hidden: true }, icon("warn", "small"), words);
   find("#header").append(bar);
-  events.on("offline", () => (bar.hidden = false));
-  events.on("online", () => (bar.hidden = true));
+  let waits = false;
+  const show = () => {
+    bar.hidden = events.online && !waits;
+    words.textContent = `The server does not answer – trying again${waits ? "; your edits wait here to be saved" : ""}`;
+  };
+  events.on("offline", show);
+  events.on("online", show);
+  store.on("saving", (state) => {
+    waits = state === "waiting";
+    show();
+  });
 }
 
 /** @param {string} id @param {StepName} step */
@@ -190,10 +195,10 @@ function setAction(button, enabled, words) {
   button.setAttribute("aria-label", words);
 }
 
-/** @param {HTMLElement} element @param {"saved" | "saving" | "failed"} state */
+/** @param {HTMLElement} element @param {import("../lib/store.js").Saving} state */
 function showSaving(element, state) {
-  const words = { saved: "Saved", saving: "Saving…", failed: "Not saved" }[state];
-  element.className = `save-state ${state === "failed" ? "bad" : ""}`;
+  const words = { saved: "Saved", saving: "Saving…", waiting: "Not saved yet", failed: "Not saved" }[state];
+  element.className = `save-state ${state === "failed" || state === "waiting" ? "bad" : ""}`;
   element.dataset.state = state;
   fill(
     element,

@@ -33,7 +33,7 @@ export async function openPage(step) {
     const store = await ProjectStore.open(id);
     const events = new ServerEventStream(id);
     projectHeader(store, step, events);
-    tellConnection(events);
+    tellConnection(events, store);
     tellTroubles(store);
     window.addEventListener("beforeunload", (event) => store.hasUnsaved && event.preventDefault());
     events.on("hello", ({ revision }) => store.heardOf(revision));

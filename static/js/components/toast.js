@@ -2,7 +2,7 @@
 
 import { h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
-import { ApiError, isAbort, sentence } from "../lib/api.js";
+import { isAbort, isOffline, sentence } from "../lib/api.js";
 
 /**
  * @typedef {object} ToastOptions
@@ -43,7 +43,7 @@ export function toast(message, { tone = "info", action, seconds = tone === "bad"
 
 /** Tell what went wrong in the engine's sentence; our own cancelling is no news, nor what a bar says already. @param {unknown} error */
 export function toastError(error) {
-  const said = error instanceof ApiError && error.kind === "offline" && document.querySelector(".connection-bar:not([hidden])");
+  const said = isOffline(error) && document.querySelector(".connection-bar:not([hidden])");
   if (!isAbort(error) && !said) toast(sentence(error), { tone: "bad" });
 }
 
@@ -59,7 +59,7 @@ function makeRoom() {
   for (let i = 0; i < passing.length && tray.children.length > 4; i++) passing[i].remove();
 }
 
-/** Wait while the pointer rests on it. @param {HTMLElement} element @param {number} seconds */
+/** Wait while the pointer rests on one of its buttons. @param {HTMLElement} element @param {number} seconds */
 function hideAfter(element, seconds) {
   element.dataset.passing = "";
   let timer = window.setTimeout(() => element.remove(), seconds * 1000);

@@ -3,6 +3,8 @@
 import { told } from "./problems.js";
 
 const GUARD = { "X-Rooftrack": "1" };
+/** A server that does not answer is asked again after so long. */
+export const TRIES_AGAIN_MS = 1500;
 
 /** What the server refused, in the engine's own sentence. */
 export class ApiError extends Error {
@@ -78,7 +80,8 @@ export function projectPath(id, rest = "", query = {}) {
 }
 
 /**
- * Stream a file from disk, never holding it in memory. Aborting leaves nothing behind on the server.
+ * Stream a file from disk, never holding it in memory. Aborting leaves nothing behind on the server. Whoever leaves the
+ * page meanwhile is asked first.
  * @param {"PUT" | "POST"} method
  * @param {string} path
  * @param {Blob} file
@@ -103,9 +106,15 @@ export function upload(method, path, file, onProgress, signal) {
       reject(new ApiError(0, { message: "The upload broke off; nothing was kept. Try again.", kind: "offline" }));
     transfer.onabort = () => reject(new DOMException("cancelled", "AbortError"));
     signal?.addEventListener("abort", () => transfer.abort());
+    const ask = (/** @type {Event} */ leaving) => leaving.preventDefault();
+    window.addEventListener("beforeunload", ask);
+    transfer.onloadend = () => window.removeEventListener("beforeunload", ask);
     transfer.send(file);
   });
 }
+
+/** Whether no answer came, so that it is worth asking again. @param {unknown} error */
+export const isOffline = (error) => error instanceof ApiError && error.kind === "offline";
 
 /** Whether an error only says that we ourselves cancelled. @param {unknown} error */
 export const isAbort = (error) => error instanceof DOMException && error.name === "AbortError";

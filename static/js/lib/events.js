@@ -4,7 +4,7 @@
 // that its server is gone shows progress that is none.
 
 import { Emitter } from "./emitter.js";
-import { projectPath } from "./api.js";
+import { projectPath, TRIES_AGAIN_MS } from "./api.js";
 
 /**
  * @typedef {object} ServerEvents
@@ -20,8 +20,6 @@ import { projectPath } from "./api.js";
  * @property {null} offline the server does not answer
  * @property {null} online it answers again
  */
-
-const TRIES_AGAIN_MS = 1500;
 
 const NAMES = /** @type {const} */ ([
   "hello",

@@ -1,4 +1,7 @@
-// Questions that are asked faster than they are answered (while dragging): one under way, only the newest waits.
+// Questions that are asked faster than they are answered (while dragging): one under way, only the newest waits. What
+// a server did not answer is asked again, so that no answer to an older question stays on the page.
+
+import { isOffline, TRIES_AGAIN_MS } from "./api.js";
 
 /**
  * @template Argument, Result
@@ -17,7 +20,10 @@ export function latest(ask, onAnswer, onError) {
       const result = await ask(argument);
       if (waiting === null) onAnswer(result, argument);
     } catch (error) {
-      if (waiting === null) onError(error);
+      if (isOffline(error)) {
+        await new Promise((resolve) => setTimeout(resolve, TRIES_AGAIN_MS));
+        waiting ??= { argument };
+      } else if (waiting === null) onError(error);
     }
     busy = false;
     const newest = waiting;

@@ -1,20 +1,22 @@
 // The project as this tab knows it. An edit shows at once, is saved at once, and is one step of the server's history.
 // Edits wait for each other, so the revision is always the one the server gave last; an edit on top of somebody
-// else's newer state is refused by the server (409), and told, not obeyed.
+// else's newer state is refused by the server (409), and told, not obeyed. A server that does not answer loses none:
+// they stay as they are shown, and are saved as soon as it does.
 
 import { Emitter } from "./emitter.js";
-import { ApiError, get, post, projectPath, put } from "./api.js";
+import { ApiError, get, isOffline, post, projectPath, put, TRIES_AGAIN_MS } from "./api.js";
 
 /** @typedef {import("./types.js").Project} Project */
 /** @typedef {import("./types.js").ProjectState} ProjectState */
 /** @typedef {(draft: Project) => void} Change */
 /** @typedef {{label: string, change: Change, merge: boolean}} Edit */
+/** @typedef {"saved" | "saving" | "waiting" | "failed"} Saving  waiting: for a server that does not answer */
 
 /**
  * @typedef {object} StoreEvents
  * @property {{project: Project, previous: Project, origin: "edit" | "saved" | "server" | "undo"}} change
- * @property {"saved" | "saving" | "failed"} saving
- * @property {{labels: string[], error: unknown, again: () => void}} lost  taken back for no fault of theirs: another tab was faster, or no answer came; `again` repeats them in order on the newest state
+ * @property {Saving} saving
+ * @property {{labels: string[], error: unknown, again: () => void}} lost  taken back for no fault of theirs: another tab was faster; `again` repeats them in order on the newest state
  * @property {{label: string, error: unknown}} refused  the server found the edit wrong; it was taken back, those behind it go on
  */
 
@@ -105,7 +107,7 @@ export class ProjectStore extends Emitter {
       try {
         this.#adopt(await post(projectPath(this.id, which), { revision: this.revision }), "undo");
       } catch (error) {
-        if (!(error instanceof ApiError && error.status === 409)) throw error;
+        if (!isConflict(error)) throw error;
         await this.#reload();
         this.emit("lost", { labels: [which], error, again: () => void this.#step(which) });
       }
@@ -123,16 +125,34 @@ export class ProjectStore extends Emitter {
   /** @param {Edit} edit */
   async #save(edit) {
     this.emit("saving", "saving");
-    const { label, merge } = edit;
-    const project = changed(this.state.project, edit.change);
     let state;
     try {
-      state = await put(projectPath(this.id), { project, revision: this.revision, label, merge });
+      state = await this.#stored(edit);
     } catch (error) {
       return this.#takeBack(edit, error);
     }
     this.#adopt({ ...this.state, ...state }, "saved");
     this.emit("saving", "saved");
+  }
+
+  /** The state with an edit in it, however long the server takes to answer. @param {Edit} edit @returns {Promise<ProjectState>} */
+  async #stored({ label, change, merge }) {
+    const edited = { project: changed(this.state.project, change), revision: this.revision, label, merge };
+    for (let isFirst = true; ; isFirst = false) {
+      try {
+        return (isFirst ? null : await this.#takenUnheard(label)) ?? (await put(projectPath(this.id), edited));
+      } catch (error) {
+        if (!isOffline(error)) throw error;
+        this.emit("saving", "waiting");
+        await new Promise((resolve) => setTimeout(resolve, TRIES_AGAIN_MS));
+      }
+    }
+  }
+
+  /** An edit may have been taken though its answer never came: it is the newest one then. @param {string} label @returns {Promise<ProjectState | null>} */
+  async #takenUnheard(label) {
+    const state = /** @type {ProjectState} */ (await get(projectPath(this.id)));
+    return state.revision === this.revision + 1 && state.undo_label === label ? state : null;
   }
 
   /** A wrong edit goes alone. Else those behind it go with it: they were made on a state that is shown no more. @param {Edit} edit @param {unknown} error */
@@ -190,6 +210,9 @@ export class ProjectStore extends Emitter {
     if (heard > this.revision) this.heardOf(heard);
   }
 }
+
+/** @param {unknown} error */
+const isConflict = (error) => error instanceof ApiError && error.status === 409;
 
 /** @param {Project} project @param {Change} change @returns {Project} */
 function changed(project, change) {

@@ -5,6 +5,7 @@ import { worldFromOrtho } from "../lib/coordinates.js";
 import { fill, find, h } from "../lib/dom.js";
 import { degrees, fixed, metres, millimetres } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
+import { told } from "../lib/problems.js";
 import { Targets } from "../lib/targets.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { isRunning, jobCard } from "../components/job-card.js";
@@ -206,7 +207,7 @@ function showJob(running) {
   job.show(running);
   making = isRunning(running);
   make.disabled = making;
-  if (running.state === "done") void load();
+  if (running.state === "done" || running.state === "failed") void load();
 }
 
 function showSettings() {
@@ -271,7 +272,7 @@ function showGround(cloud) {
         "Without a point cloud, ground coordinates are typed beside each correspondence, and heights in Regions.",
       ),
     );
-  if (cloud.error) return fill(ground, note("bad", cloud.error.message));
+  if (cloud.error) return fill(ground, note("bad", told(cloud.error.message).words));
   if (cloud.reading || !cloud.ground)
     return fill(
       ground,

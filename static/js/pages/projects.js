@@ -98,7 +98,7 @@ function card(project) {
     h(
       "header",
       {},
-      h("h2", {}, h("a", { href: `/p/${encodeURIComponent(project.id)}` }, project.name)),
+      h("h2", { title: project.name }, h("a", { href: `/p/${encodeURIComponent(project.id)}` }, project.name)),
       // Two projects may be called the same, as a copied folder's; two folders may not.
       project.id !== project.name && h("span", { class: "folder faint small", title: project.id }, `in folder ${project.id}`),
       h("span", { class: "faint small" }, ago(project.updated_s)),
