@@ -9,9 +9,10 @@ import av
 import numpy as np
 import pytest
 from av.stream import Disposition
+from av.video.frame import PictureType
 
 from core.errors import InputError
-from core.video import FramesAhead, Luma, frame_index, probe, read_frame, read_frames, read_frames_rgb
+from core.video import FramesAhead, Luma, frame_index, luma_of, probe, read_frame, read_frames, read_frames_rgb
 from tests.packets import repacked
 
 SIZE = (96, 64)
@@ -106,6 +107,16 @@ def test_frames_come_in_presentation_order(video: Path) -> None:
     assert [number_of(frame.luma) for frame in frames] == list(range(FRAMES))
     assert frames[0].luma.shape == (64, 96)
     assert frames[0].luma.dtype == np.uint8
+
+
+def test_only_pictures_that_no_other_is_told_from_keep_the_edges_of_their_blocks(tmp_path: Path) -> None:
+    file = write(tmp_path / "coarse.mp4", options={"crf": "38", "b-pyramid": "none", "x264-params": "scenecut=0"})
+    with av.open(str(file)) as container:
+        shown = [(frame.pict_type, luma_of(frame).copy()) for frame in container.decode(video=0)]
+    referred = [kind != PictureType.B for kind, _ in shown]
+    as_shown = [bool((frame.luma == luma).all()) for frame, (_, luma) in zip(read_frames(file), shown, strict=True)]
+    assert np.array(as_shown)[referred].all()
+    assert not all(as_shown)
 
 
 @pytest.mark.parametrize("start", [1, 11, 12, 13, 37, FRAMES - 1])
