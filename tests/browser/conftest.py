@@ -10,13 +10,8 @@ from playwright.sync_api import expect
 
 from tests.browser.live import SAMPLE, chromium, folder_name, free_port, measured_sample, serving, shared_folder
 
-# What is awaited comes sooner or later: a busy computer, or two tests side by side on a small one, make nothing wrong.
+# What is awaited comes sooner or later: a busy computer makes nothing wrong.
 expect.set_options(timeout=30_000)
-
-
-def pytest_collection_modifyitems(items):
-    """Begin with what takes longest, so that no test process has to wait for another at the end."""
-    items.sort(key=lambda item: item.path.name != "test_whole_way.py")
 
 
 @pytest.fixture(scope="session")
