@@ -254,7 +254,7 @@ def _problems(folder: ProjectFolder, project: Project, look: bool) -> list[str] 
     key = (str(folder.folder), project_json(project), outcome.input_stamps(folder, project))
     if look and key not in _known_problems:
         place = f"{folder.folder}{os.sep}"
-        found = [problem.replace(place, "") for problem in check_project(folder.folder, with_cloud=False)]
+        found = [problem.replace(place, "") for problem in check_project(folder.folder, thorough=False)]
         if folder.named_input("video", project) is None:
             found = [_NO_VIDEO if problem.startswith(f"{project.inputs.video}:") else problem for problem in found]
         while len(_known_problems) >= _PROBLEMS_KEPT:

@@ -59,11 +59,11 @@ class _Inputs:
     reference: ReferenceFit | None
 
 
-def check_project(folder: Path, progress: Progress = silent, *, with_cloud: bool = True) -> list[str]:
+def check_project(folder: Path, progress: Progress = silent, *, thorough: bool = True) -> list[str]:
     """Return each problem of a project folder, one line each with its remedy; none means that it can be measured.
 
     Args:
-        with_cloud: whether to look at what takes a while too: the point cloud, a minute for a large one, and what the
+        thorough: whether to look at what takes a while too: the point cloud, a minute for a large one, and what the
             reference frame shows in the search bands.
     """
     file = folder / PROJECT_FILE
@@ -72,11 +72,11 @@ def check_project(folder: Path, progress: Progress = silent, *, with_cloud: bool
     except InputError as error:
         return _problems_of_file(file) or [str(error)]
     problems: list[str] = []
-    inputs = _read_inputs(folder, project, problems, progress, with_cloud=with_cloud)
+    inputs = _read_inputs(folder, project, problems, progress, thorough=thorough)
     problems += [f"{file}: {problem}." for problem in obstacles(project, inputs.index, inputs.reference)]
     for check in (_video_problems, _correspondence_problems, _region_problems, _target_problems, _time_problems):
         problems += [f"{file}: {problem}." for problem in check(project, inputs)]
-    if with_cloud and not problems and inputs.reference is not None:
+    if thorough and not problems and inputs.reference is not None:
         setup = MeasureSetup.of(project, file_at(folder, project.inputs.video), inputs.reference)
         _tried(folder, problems, make_measurer, setup, None, inputs.index)
     return problems
@@ -138,9 +138,7 @@ def _problems_of_file(file: Path) -> list[str]:
     return [f"{file}: {problem}." for problem in project_problems(document)]
 
 
-def _read_inputs(
-    folder: Path, project: Project, problems: list[str], progress: Progress, *, with_cloud: bool
-) -> _Inputs:
+def _read_inputs(folder: Path, project: Project, problems: list[str], progress: Progress, *, thorough: bool) -> _Inputs:
     def tried(read: Callable[..., Result], *arguments: object) -> Result | None:
         return _tried(folder, problems, read, *arguments)
 
@@ -151,7 +149,7 @@ def _read_inputs(
     lens = tried(read_lens, folder / given.lens) if given.lens else None
     if given.lens and lens and info:
         tried(_require_lens_of_video, lens, folder / given.lens, info, video)
-    cloud = tried(read_cloud, folder / given.cloud, progress) if given.cloud and with_cloud else None
+    cloud = tried(read_cloud, folder / given.cloud, progress) if given.cloud and thorough else None
     if cloud:
         tried(_require_ground, cloud, project, folder)
     if given.gps:

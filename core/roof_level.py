@@ -6,6 +6,8 @@ nothing from being measured; it is a sentence for whoever uses the result.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from core.camera import Pose
@@ -94,6 +96,14 @@ def height_doubt(target: Target, shown_m: float | None, camera: Pose | None) -> 
         f"height_m of {target.name} is {target.height_m:.2f} m, but the point cloud shows it {shown_m:.2f} m above the "
         "ground; check height_m and orthoimage.ground_z_m."
     )
+
+
+def doubts(
+    target: Target, places_m: Floats, *, height_m: float | None, shown_m: float | None, camera: Pose | None
+) -> Iterator[str]:
+    """Yield everything about a target's height and known distance that is doubtful; see the two above."""
+    both = distance_doubt(target, places_m, height_m=height_m), height_doubt(target, shown_m, camera)
+    yield from (doubt for doubt in both if doubt is not None)
 
 
 def refuse_if(obstacle: str | None, target: Target) -> None:

@@ -25,7 +25,7 @@ from core.motion import RigidFit
 from core.project import Project, Target
 from core.relief import Relief
 from core.results import MEASURED, TargetHistory
-from core.roof_level import distance_doubt, height_doubt, height_obstacle, refuse_if, scale_at_roof
+from core.roof_level import doubts, height_obstacle, refuse_if, scale_at_roof
 from core.row_times import Readout, at_frame_times, estimated_readout, ground_speed
 from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution, TargetSolution, frame_status
@@ -119,8 +119,7 @@ def _doubts(
         at_rest = body.stations if body.points is None else body.points
         assert at_rest is not None
         shown_m = None if relief is None else relief.stands_at(at_rest[finite_rows(at_rest)] + origin_m)
-        doubts = distance_doubt(target, body.places, height_m=height_m), height_doubt(target, shown_m, used.pose0)
-        yield from (doubt for doubt in doubts if doubt is not None)
+        yield from doubts(target, body.places, height_m=height_m, shown_m=shown_m, camera=used.pose0)
 
 
 def _unrest(project: Project, targets: Mapping[str, TargetSolution]) -> Iterator[str]:

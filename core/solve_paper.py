@@ -21,7 +21,7 @@ from core.motion import regress_lines
 from core.project import Project, Target
 from core.relief import Relief
 from core.results import TargetHistory
-from core.roof_level import distance_doubt, height_doubt, refuse_if, scale_at_roof, scale_obstacle
+from core.roof_level import doubts, refuse_if, scale_at_roof, scale_obstacle
 from core.solution import Ground, Solution, TargetSolution, frame_status
 from core.uncertainty import GROUND_PART, held_to_jitter
 
@@ -68,8 +68,7 @@ def _doubts(recording: Recording, project: Project, reference: ReferenceFit, rel
         places = _rest(target, reference, np.stack([lines.intersection(0, 2)[0], lines.intersection(1, 2)[0]]))
         at_rest = _rest(target, reference, plan[finite_rows(plan)]) + reference.origin_m
         shown_m = None if relief is None else relief.stands_at(at_rest)
-        doubts = distance_doubt(target, places, height_m=target.height_m), height_doubt(target, shown_m, reference.pose)
-        yield from (doubt for doubt in doubts if doubt is not None)
+        yield from doubts(target, places, height_m=target.height_m, shown_m=shown_m, camera=reference.pose)
 
 
 def stabilise(recording: Recording, lens: Lens, H_plan_ray0: Floats) -> Ground:

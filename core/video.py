@@ -404,13 +404,14 @@ def _decoded(
             expected = number + 1
             if stop is not None and number >= stop:
                 return
-            if number >= start and whole:
-                if (picture.width, picture.height) != size:
-                    raise InputError(
-                        f"{path}: frame {number} ({index.time_s_of(number):.2f} s) is {picture.width} x "
-                        f"{picture.height} pixels, but the video begins with {size[0]} x {size[1]}; cut it there."
-                    )
-                yield number, picture
+            if number < start or not whole:
+                continue
+            if (picture.width, picture.height) != size:
+                raise InputError(
+                    f"{path}: frame {number} ({index.time_s_of(number):.2f} s) is {picture.width} x "
+                    f"{picture.height} pixels, but the video begins with {size[0]} x {size[1]}; cut it there."
+                )
+            yield number, picture
 
 
 def decoded_pictures(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:

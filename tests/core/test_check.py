@@ -238,7 +238,7 @@ def test_a_large_cloud_may_be_left_out(inputs: Path) -> None:
     document = small_project.document()
     document["inputs"]["cloud"] = "gone.laz"
     small_project.write_document(inputs, document)
-    assert check_project(inputs, with_cloud=False) == []
+    assert check_project(inputs, thorough=False) == []
 
 
 def test_nothing_is_written(inputs: Path) -> None:

@@ -18,7 +18,7 @@ import { ProjectStore } from "../lib/store.js";
 import { ServerEventStream } from "../lib/events.js";
 import { bindKeys } from "../lib/keys.js";
 import { fill, find, h } from "../lib/dom.js";
-import { ApiError, sentence } from "../lib/api.js";
+import { isConflict, sentence } from "../lib/api.js";
 import { plural } from "../lib/format.js";
 import { projectHeader, STEPS, tellConnection } from "./header.js";
 import { toast, toastError } from "./toast.js";
@@ -89,7 +89,7 @@ const these = ([first, ...rest]) =>
 
 /** @param {unknown} error */
 const whyLost = (error) =>
-  error instanceof ApiError && error.status === 409
+  isConflict(error)
     ? ": another window has changed this project. You now see its newer state."
     : `. ${sentence(error)}`;
 

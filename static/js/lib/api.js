@@ -116,6 +116,12 @@ export function upload(method, path, file, onProgress, signal) {
 /** Whether no answer came, so that it is worth asking again. @param {unknown} error */
 export const isOffline = (error) => error instanceof ApiError && error.kind === "offline";
 
+/** Resolves when a server that did not answer is worth asking again. @returns {Promise<void>} */
+export const untilNextTry = () => new Promise((resolve) => setTimeout(resolve, TRIES_AGAIN_MS));
+
+/** Whether another tab was faster. @param {unknown} error */
+export const isConflict = (error) => error instanceof ApiError && error.status === 409;
+
 /** Whether an error only says that we ourselves cancelled. @param {unknown} error */
 export const isAbort = (error) => error instanceof DOMException && error.name === "AbortError";
 

@@ -1,7 +1,7 @@
 // Questions that are asked faster than they are answered (while dragging): one under way, only the newest waits. What
 // a server did not answer is asked again, so that no answer to an older question stays on the page.
 
-import { isOffline, TRIES_AGAIN_MS } from "./api.js";
+import { isOffline, untilNextTry } from "./api.js";
 
 /**
  * @template Argument, Result
@@ -21,7 +21,7 @@ export function latest(ask, onAnswer, onError) {
       if (waiting === null) onAnswer(result, argument);
     } catch (error) {
       if (isOffline(error)) {
-        await new Promise((resolve) => setTimeout(resolve, TRIES_AGAIN_MS));
+        await untilNextTry();
         waiting ??= { argument };
       } else if (waiting === null) onError(error);
     }

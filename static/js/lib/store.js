@@ -4,7 +4,7 @@
 // they stay as they are shown, and are saved as soon as it does.
 
 import { Emitter } from "./emitter.js";
-import { ApiError, get, isOffline, post, projectPath, put, TRIES_AGAIN_MS } from "./api.js";
+import { ApiError, get, isConflict, isOffline, post, projectPath, put, untilNextTry } from "./api.js";
 
 /** @typedef {import("./types.js").Project} Project */
 /** @typedef {import("./types.js").ProjectState} ProjectState */
@@ -144,7 +144,7 @@ export class ProjectStore extends Emitter {
       } catch (error) {
         if (!isOffline(error)) throw error;
         this.emit("saving", "waiting");
-        await new Promise((resolve) => setTimeout(resolve, TRIES_AGAIN_MS));
+        await untilNextTry();
       }
     }
   }
@@ -210,9 +210,6 @@ export class ProjectStore extends Emitter {
     if (heard > this.revision) this.heardOf(heard);
   }
 }
-
-/** @param {unknown} error */
-const isConflict = (error) => error instanceof ApiError && error.status === 409;
 
 /** @param {Project} project @param {Change} change @returns {Project} */
 function changed(project, change) {
