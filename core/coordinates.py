@@ -61,6 +61,14 @@ def invert_homography(H: ArrayLike) -> Floats:
     return inverse / inverse[2, 2]
 
 
+def invert_2x2(matrices: Floats) -> Floats:
+    """Return the inverses of matrices (..., 2, 2); of many small ones several times as quick as `np.linalg.inv`."""
+    a, b, c, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 0], matrices[..., 1, 1]
+    adjugate = np.empty_like(matrices)
+    adjugate[..., 0, 0], adjugate[..., 0, 1], adjugate[..., 1, 0], adjugate[..., 1, 1] = d, -b, -c, a
+    return np.asarray(adjugate / (a * d - b * c)[..., None, None])
+
+
 def finite_rows(points: Floats) -> Bools:
     """Return which points (..., D) have all their coordinates, (...)."""
     return np.asarray(np.isfinite(points).all(axis=-1), dtype=np.bool_)

@@ -19,9 +19,18 @@ from core.coordinates import Floats, apply_homography, finite_rows
 from core.errors import InputError
 from core.ground import ALIKE_SCORE, NOISY_ROUNDS, View, choose_features_within, homography_jacobian
 from core.lens import Lens
-from core.motion import LineSet, RigidFit, fit_line, is_determined, rigid_from_points, rough_rigid_from_lines
+from core.motion import (
+    LineSet,
+    RigidFit,
+    fit_line,
+    is_determined,
+    is_determined_as_whole,
+    rigid_from_points,
+    rigid_with_weights,
+)
 from core.patches import PatchTracker, Singles
 from core.project import LINE_NAMES, Target
+from core.robust import finite_median
 from core.roof_lines import NOT_FOUND, STATIONS, LineMatch, LineTracker, find_strips
 from core.video import Luma
 
@@ -184,7 +193,7 @@ class LinesFollower:
             LineTracker(luma, end, still, width_px=width, name=name)
             for end, width, name in zip(ends, widths_px, names, strict=True)
         ]
-        matches = [tracker.find(luma, still) for tracker in self.trackers]
+        matches = find_strips(self.trackers, luma, still)
         for match, name in zip(matches, names, strict=True):
             if match.measured < LEAST_STATIONS:
                 raise InputError(
@@ -195,6 +204,7 @@ class LinesFollower:
         rays = lens.rays_from_raw(self.reference_raw.mean(axis=2))
         lines = [fit_line(points, np.ones(STATIONS), self._centre) for points in rays]
         self._lines = LineSet(np.array([n for n, _ in lines]), np.array([o for _, o in lines]), self._centre)
+        self._whole = self._rigid(matches, np.eye(3)).normal[0]
         self._finder = TargetFinder(luma, ends.reshape(-1, 2), lens, scale)
 
     def find(
@@ -225,20 +235,30 @@ class LinesFollower:
     def _measure(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent) -> TargetMatch:
         to_raw = self._mapping(H_ray_ray0, predicted)
         matches = find_strips(self.trackers, luma, to_raw, search_px=self._search_px)
-        apparent = self._apparent(matches, H_ray_ray0, predicted)
+        fit = self._rigid(matches, H_ray_ray0)
+        apparent = _apparent_of(fit) if is_determined_as_whole(fit.normal, self._whole)[0] else None
         return TargetMatch(np.stack([match.edges_raw for match in matches]), apparent)
 
-    def _apparent(self, matches: list[LineMatch], H_ray_ray0: Floats, predicted: Apparent) -> Apparent | None:
+    def _rigid(self, matches: list[LineMatch], H_ray_ray0: Floats) -> RigidFit:
+        """Return the lines' motion as well as following needs it, from a few points and by two steps."""
         usable = [match if match.measured >= LEAST_STATIONS else NOT_FOUND for match in matches]
-        rays = self._lens.rays_from_raw(np.stack([match.midline_raw for match in usable]))
+        rays = self._lens.rays_from_raw(_middles_of_halves(np.stack([match.midline_raw for match in usable])))
         rays0 = apply_homography(np.linalg.inv(H_ray_ray0), rays)
-        return _apparent_of(rough_rigid_from_lines(rays0, self._lines, predicted.shift, predicted.rotation_rad))
+        weight = np.ones((1, *rays0.shape[:2]))
+        return rigid_with_weights(rays0[None], weight, self._lines, self._centre, iterations=2)
 
     def _mapping(self, H_ray_ray0: Floats, apparent: Apparent) -> Callable[[Floats], Floats]:
         def to_raw(rays0: Floats) -> Floats:
             return self._lens.raw_from_rays(apply_homography(H_ray_ray0, apparent.apply(rays0, self._centre)))
 
         return to_raw
+
+
+def _middles_of_halves(midlines_raw: Floats) -> Floats:
+    """Return the median points (L, 2, 2) of both halves of mid-lines (L, STATIONS, 2); nan of those hardly seen."""
+    halves = midlines_raw.reshape(len(midlines_raw), 2, -1, 2).swapaxes(2, 3)
+    seen = np.isfinite(halves).sum(axis=-1) >= LEAST_STATIONS // 4
+    return np.where(seen, finite_median(halves), np.nan)
 
 
 class PointsFollower:
@@ -325,7 +345,7 @@ class PointsFollower:
         if finite_rows(raw).sum() < max(6, len(raw) // 4):
             return TargetMatch(np.full_like(raw, np.nan), None)
         fit = rigid_from_points(rays0[None], np.ones((1, len(rays0))), self._rays0, self._centre)
-        return TargetMatch(raw, _apparent_of(fit))
+        return TargetMatch(raw, _apparent_of(fit) if is_determined(fit.normal)[0] else None)
 
     def _expected(self, H_ray_ray0: Floats, apparent: Apparent) -> tuple[Floats, Floats]:
         """Return where the patches should be, (N, 2) raw pixels, and how they are deformed, as `PatchTracker.track`."""
@@ -337,9 +357,7 @@ class PointsFollower:
         return self._lens.raw_from_rays(rays), np.linalg.inv(J)
 
 
-def _apparent_of(fit: RigidFit) -> Apparent | None:
-    if not is_determined(fit.normal)[0]:
-        return None
+def _apparent_of(fit: RigidFit) -> Apparent:
     return Apparent(fit.shift[0], float(fit.rotation_rad[0]))
 
 

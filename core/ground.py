@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.coordinates import Bools, Floats, apply_homography, finite_rows
+from core.coordinates import Bools, Floats, apply_homography, finite_rows, invert_2x2
 from core.errors import InputError
 from core.lens import Lens
 from core.patches import HALF_PX, MARGIN_PX, Matches, PatchTracker, Singles
@@ -85,7 +85,7 @@ class ExpectedFeatures:
 
     def rays_seen(self, raw: Floats) -> Floats:
         """Return the rays (N, 2) of raw pixels that lie a pixel or two beside, good to a thousandth of a pixel."""
-        return np.asarray(self.rays + np.linalg.solve(self.J_raw_rays, (raw - self.raw)[..., None])[..., 0])
+        return np.asarray(self.rays + (invert_2x2(self.J_raw_rays) @ (raw - self.raw)[..., None])[..., 0])
 
 
 def choose_features(luma: Luma, moving_regions_px: Sequence[Sequence[tuple[float, float]]], count: int) -> Floats:
@@ -186,7 +186,7 @@ class GroundTracker:
         self.patches = PatchTracker(luma, points_raw)
         self._lens = lens
         self._rays0 = lens.rays_from_raw(points_raw)
-        self._J0_inverse = np.linalg.inv(lens.jacobian_raw_rays(self._rays0))
+        self._J0_inverse = invert_2x2(lens.jacobian_raw_rays(self._rays0))
         self._finder = CameraFinder(luma, lens, allowed)
 
     def look_ahead(self, lumas: Iterable[Luma]) -> Iterator[View]:
@@ -267,7 +267,7 @@ class GroundTracker:
         usable: Bools = np.asarray(np.isfinite(J).all(axis=(1, 2)))
         J[~usable] = J_raw_rays[~usable] = np.eye(2)
         raw = np.where(usable[:, None], self._lens.raw_from_rays(rays), np.nan)
-        return ExpectedFeatures(rays, raw, J_raw_rays, np.linalg.inv(J))
+        return ExpectedFeatures(rays, raw, J_raw_rays, invert_2x2(J))
 
 
 def homography_jacobian(H: Floats, points: Floats) -> Floats:

@@ -20,8 +20,8 @@ from core.coordinates import Floats, batches, read_only
 from core.errors import InputError
 from core.storage import File, write_atomically
 
-# Newton's method doubles the number of right digits: after a step this small the ray is exact in float64.
-_LAST_STEP = 1e-9
+# Newton's method doubles the number of right digits: after a step this small the ray is exact to 1e-13 or so.
+_LAST_STEP = 1e-7
 _MAX_STEPS = 40
 # Points undistorted at a time: what they need besides themselves stays small, and near the processor.
 _BLOCK = 1 << 15

@@ -220,32 +220,6 @@ def rigid_from_lines(
     return RigidFit(shift, angle, np.where(seen, residual, np.nan), used, normal, sigma)
 
 
-def rough_rigid_from_lines(points: Floats, lines: LineSet, shift: Floats, rotation_rad: float) -> RigidFit:
-    """Return the rigid motion of one frame from the medians of each line's halves: quick, and good enough to follow.
-
-    Args:
-        points: (L, K, 2) mid-line points, nan where not measured; K is even.
-        shift, rotation_rad: predicted, where the one step begins.
-
-    Returns:
-        The motion with F = 1, and the residuals from before the step; its normal matrix is singular where the lines do
-        not fix it.
-    """
-    count, stations, _ = points.shape
-    seen = finite_rows(points)[None]
-    x = np.where(seen[..., None], points - lines.centre, 0.0)
-    target = np.broadcast_to(lines.offset[:, None], (count, stations))
-    move, angle = shift[None], np.array([rotation_rad])
-    residual, J = _line_residual(x, move, angle, lines.normal, target)
-    residual = np.where(seen, residual, np.nan)
-    middle = finite_median(residual.reshape(1, 2 * count, -1))
-    weight = seen.reshape(1, 2 * count, -1).sum(axis=-1).astype(np.float64)
-    J_half = np.where(seen[..., None], J, 0.0).reshape(1, 2 * count, -1, 3).sum(axis=2)
-    normal, step = _gauss_newton(J_half / np.maximum(weight, 1.0)[..., None], middle, weight)
-    used = seen.astype(np.float64)
-    return RigidFit(move + step[:, :2], angle + step[:, 2], residual, used, normal, np.ones((1, count)))
-
-
 def _line_residual(x: Floats, shift: Floats, angle: Floats, normal: Floats, target: Floats) -> tuple[Floats, Floats]:
     """Return how far (F, L, K) each point lies beyond its moved line and the derivatives (F, L, K, 3) of the model."""
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
@@ -260,7 +234,9 @@ def _line_residual(x: Floats, shift: Floats, angle: Floats, normal: Floats, targ
     return distance - target, J
 
 
-def rigid_with_weights(points: Floats, weight: Floats, at_rest: LineSet | Floats, centre: Floats) -> RigidFit:
+def rigid_with_weights(
+    points: Floats, weight: Floats, at_rest: LineSet | Floats, centre: Floats, *, iterations: int = PLAIN_ITERATIONS
+) -> RigidFit:
     """Return the rigid motion by plain least squares with weights that are given, such as those of an earlier fit.
 
     Unlike the robust fits it depends smoothly on the points, as derivatives need.
@@ -275,7 +251,7 @@ def rigid_with_weights(points: Floats, weight: Floats, at_rest: LineSet | Floats
     used = np.where(seen, weight, 0.0)
     shift, angle, normal = np.zeros((len(points), 2)), np.zeros(len(points)), np.zeros((len(points), 3, 3))
     residual, spread = np.zeros(used.shape), used
-    for _ in range(PLAIN_ITERATIONS):
+    for _ in range(iterations):
         if isinstance(at_rest, LineSet):
             target = np.broadcast_to(at_rest.offset[:, None], used.shape[1:])
             residual, J = _line_residual(x, shift, angle, at_rest.normal, target)

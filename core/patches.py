@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.coordinates import Floats
+from core.coordinates import Floats, batches, invert_2x2
 from core.video import Luma
 
 Singles = NDArray[np.float32]
@@ -28,6 +28,13 @@ HALF_PX = 10  # patches of 21 x 21 pixels: 400 of them are 0.18 megapixel
 MARGIN_PX = 6  # room for deformation and for the interpolation kernel
 TILE_HALF_PX = HALF_PX + MARGIN_PX
 OVERSAMPLING = 2  # linear interpolation between half pixels errs below the noise of 8-bit video
+# A template reaches a pixel beyond its patch on all sides, for its slopes.
+SIDE = 2 * HALF_PX + 1
+TEMPLATE_SIDE = SIDE + 2
+# Patches worked on together: what they need stays near the processor, which takes half the time.
+BLOCK = 48
+# Pictures that OpenCV samples are no higher than this.
+MOST_ROWS = 32766
 # A patch that takes more than a few steps shows something else.
 MAX_ITERATIONS = 4
 # Central differences see fine texture flatter than it is, and take steps too long by a seventh. Of a step shortened by
@@ -85,7 +92,7 @@ class PatchTracker:
 
     def _lay_out(self) -> None:
         corner = _tile_corners(len(self))
-        self._mosaics = [_oversampled(tiles, corner) for tiles in self._tiles]
+        self._mosaics = [_oversampled(_without_mean(tiles), corner) for tiles in self._tiles]
         # Pixel centres: enlarged index = OVERSAMPLING * (index + 1/2) - 1/2.
         self._tile_origin = corner + OVERSAMPLING * (TILE_HALF_PX + 0.5) - 0.5
         side = np.arange(-HALF_PX - 1, HALF_PX + 2, dtype=np.float64)
@@ -148,12 +155,11 @@ class PatchTracker:
         mosaic = self._mosaics[-1 if is_view else 0]
         raw, score = np.full((len(self), 2), np.nan), np.full(len(self), np.nan)
         corner = np.rint(np.where(np.isfinite(predicted_raw), predicted_raw, -1e6)).astype(np.int64) - HALF_PX
-        size = 2 * HALF_PX + 1
-        inside = ((corner >= 0) & (corner + size <= np.array(luma.shape[::-1]))).all(axis=1)
+        inside = ((corner >= 0) & (corner + SIDE <= np.array(luma.shape[::-1]))).all(axis=1)
         index = np.flatnonzero(inside)
         if not len(index):
             return Matches(raw, score)
-        pixels = _cut_out(luma, corner[index], size).astype(np.float32)
+        pixels = _cut_out(luma, corner[index], SIDE)
         found, score[index] = self._align(mosaic, index, pixels, predicted_raw[index], ref_from_current[index])
         wandered = np.abs(found - predicted_raw[index]).max(axis=1) > MAX_WANDER_PX
         found[wandered], score[index[wandered]] = np.nan, np.nan
@@ -164,7 +170,7 @@ class PatchTracker:
         self,
         mosaic: Singles,
         index: NDArray[np.int64],
-        pixels: Singles,
+        pixels: Luma,
         predicted_raw: Floats,
         ref_from_current: Floats,
     ) -> tuple[Floats, Floats]:
@@ -173,13 +179,12 @@ class PatchTracker:
         position = predicted_raw.copy()
         score = np.zeros(len(index))
         active = np.arange(len(index))
-        frame = pixels.reshape(len(index), -1)
-        frame -= frame.mean(axis=1, keepdims=True)
+        frame = _in_template_columns(_without_mean(pixels))
         energy = np.vecdot(frame, frame).astype(np.float64)
         for _ in range(MAX_ITERATIONS):
             offset, offset_ref = self._snapped(index[active], (centre - position)[active], ref_from_current[active])
-            template = self._template(mosaic, index[active], offset_ref, ref_from_current[active])
-            step, score[active] = _step(frame, energy, template)
+            coefficients = self._coefficients(index[active], offset_ref, ref_from_current[active])
+            step, score[active] = _step(energy, self._products(mosaic, coefficients, frame))
             position[active] = centre[active] - offset + step
             moving = (np.abs(step).max(axis=1) > SETTLED_PX) & (
                 np.abs(position - predicted_raw)[active].max(axis=1) < 2 * MAX_WANDER_PX
@@ -199,23 +204,49 @@ class PatchTracker:
         place = np.einsum("nij,nj->ni", ref_from_current, offset) + self.points_raw[index] - self._anchor[index]
         place = np.rint(place * grid) / grid
         within = place - self.points_raw[index] + self._anchor[index]
-        return np.linalg.solve(ref_from_current, within[..., None])[..., 0], place
+        return (invert_2x2(ref_from_current) @ within[..., None])[..., 0], place
 
-    def _template(self, mosaic: Singles, index: NDArray[np.int64], place: Floats, ref_from_current: Floats) -> Singles:
-        """Return the reference as the frame should show it, (n, size + 2, size + 2), around `place` (n, 2) of it."""
+    def _coefficients(self, index: NDArray[np.int64], place: Floats, ref_from_current: Floats) -> Singles:
+        """Return affine maps (n, 2, 3) to the mosaic from pixels about the middles of patches, which are at `place`."""
         coefficients = np.concatenate([ref_from_current, place[..., None]], axis=2)
         coefficients *= OVERSAMPLING
         coefficients[..., 2] += self._tile_origin[index]
-        maps = coefficients.astype(np.float32) @ self._grid
-        side = 2 * HALF_PX + 3
-        sampled = cv2.remap(mosaic, maps[:, 0], maps[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(sampled, dtype=np.float32).reshape(len(index), side, side)
+        return coefficients.astype(np.float32)
+
+    def _products(self, mosaic: Singles, coefficients: Singles, frame: Singles) -> Floats:
+        """Return what a step needs to know of the reference, as the frame should show it, and of the frame.
+
+        Args:
+            coefficients: (n, 2, 3) where in the mosaic to find it.
+            frame: (n, SIDE * TEMPLATE_SIDE), as `_in_template_columns`.
+
+        Returns:
+            Scalar products (n, 3, 5) of the reference and of its differences over two pixels along u and v with those
+            three, with the frame and with ones.
+        """
+        W = TEMPLATE_SIDE
+        products = np.empty((len(frame), 3, 5), np.float32)
+        work = np.ones((min(BLOCK, len(frame)), 5, SIDE * W), np.float32)
+        for block in batches(len(frame), BLOCK):
+            maps = coefficients[block] @ self._grid
+            # A patch is one long row of all its rows. Differences across the seams fall into the outer columns.
+            rows = cv2.remap(mosaic, maps[:, 0], maps[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            part = work[: len(rows)]
+            np.multiply(rows[:, W:-W], _INNER_COLUMNS, out=part[:, 0])
+            np.subtract(rows[:, W + 1 : 1 - W], rows[:, W - 1 : -W - 1], out=part[:, 1])
+            np.subtract(rows[:, 2 * W :], rows[:, : -2 * W], out=part[:, 2])
+            part[:, 1:3] *= _INNER_COLUMNS
+            part[:, 3] = frame[block]
+            np.matmul(part[:, :3], part.mT, out=products[block])
+        return products.astype(np.float64)
 
 
 def _tile_corners(count: int) -> NDArray[np.int64]:
     """Return the mosaic coordinates (N, 2), as u, v, of the first pixel of each oversampled tile."""
-    number, columns = np.arange(count), max(1, int(np.ceil(np.sqrt(count))))
-    return np.stack([number % columns, number // columns], axis=1) * (2 * TILE_HALF_PX + 1) * OVERSAMPLING
+    number, tile = np.arange(count), (2 * TILE_HALF_PX + 1) * OVERSAMPLING
+    # Below one another, pixels of a tile lie together in memory.
+    columns = -(-count * tile // MOST_ROWS)
+    return np.stack([number % max(columns, 1), number // max(columns, 1)], axis=1) * tile
 
 
 def _oversampled(tiles: NDArray[Any], corner: NDArray[np.int64]) -> Singles:
@@ -247,34 +278,43 @@ def _correlation(left: Singles, right: Singles) -> Floats:
     within = slice(MARGIN_PX, -MARGIN_PX)
     a, b = (tiles[:, within, within].reshape(len(tiles), -1) for tiles in (left, right))
     a, b = (pixels - pixels.mean(axis=1, keepdims=True) for pixels in (a, b))
-    return _products(a, b) / np.sqrt(np.maximum(_products(a, a) * _products(b, b), 1e-9))
+    return np.asarray(np.vecdot(a, b) / np.sqrt(np.maximum(np.vecdot(a, a) * np.vecdot(b, b), 1e-9)))
 
 
-def _step(frame: Singles, energy: Floats, template: Singles) -> tuple[Floats, Floats]:
+def _without_mean(tiles: NDArray[Any]) -> Singles:
+    """Return tiles (N, size, size) less the mean of each."""
+    return np.asarray(tiles - tiles.mean(axis=(1, 2), keepdims=True, dtype=np.float32), dtype=np.float32)
+
+
+def _in_template_columns(pixels: Singles) -> Singles:
+    """Return patches (n, SIDE, SIDE) as rows (n, SIDE * TEMPLATE_SIDE), 0 in the template's outer columns."""
+    wide = np.zeros((len(pixels), SIDE, TEMPLATE_SIDE), np.float32)
+    wide[:, :, 1:-1] = pixels
+    return wide.reshape(len(pixels), -1)
+
+
+_INNER_COLUMNS = _in_template_columns(np.ones((1, SIDE, SIDE), np.float32))[0]
+
+
+def _step(energy: Floats, products: Floats) -> tuple[Floats, Floats]:
     """Return one Gauss-Newton step (n, 2) in pixels and the correlation (n,) before it.
 
     Args:
-        frame: (n, pixels) the frame's pixels, each patch with zero mean.
-        energy: (n,) their squared norms.
-        template: (n, size + 2, size + 2) the reference around the same pixels.
+        energy: (n,) squared norm of the frame's pixels, each patch with zero mean.
+        products: (n, 3, 5) as `PatchTracker._products`.
     """
-    n = len(frame)
-    inner = np.ascontiguousarray(template[:, 1:-1, 1:-1]).reshape(n, -1)
-    inner -= inner.mean(axis=1, keepdims=True)
-    gradient_u = (template[:, 1:-1, 2:] - template[:, 1:-1, :-2]).reshape(n, -1)
-    gradient_v = (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]).reshape(n, -1)
-    power, moment = _products(inner, inner), _products(inner, frame)
-    energy, power = np.maximum(energy, 1e-9), np.maximum(power, 1e-9)
+    moment, frame_u, frame_v = products[:, :, 3].T
+    # An offset of the light is taken out of the reference and its slopes, then its gain.
+    sums = products[:, :, 4]
+    free = products[:, :, :3] - sums[:, :, None] * sums[:, None, :] / SIDE**2
+    energy, power = np.maximum(energy, 1e-9), np.maximum(free[:, 0, 0], 1e-9)
     score, gain = moment / np.sqrt(power * energy), moment / power
-    # An offset of the light is taken out of the gradients first (the others have zero mean), then its gain.
-    mean_u, mean_v = gradient_u.sum(axis=1, dtype=np.float64), gradient_v.sum(axis=1, dtype=np.float64)
-    across_u, across_v = _products(gradient_u, inner), _products(gradient_v, inner)
-    count = inner.shape[1]
-    H_uu = 0.25 * (_products(gradient_u, gradient_u) - mean_u**2 / count - across_u**2 / power)
-    H_uv = 0.25 * (_products(gradient_u, gradient_v) - mean_u * mean_v / count - across_u * across_v / power)
-    H_vv = 0.25 * (_products(gradient_v, gradient_v) - mean_v**2 / count - across_v**2 / power)
-    b_u = 0.5 * (_products(gradient_u, frame) - across_u * gain)
-    b_v = 0.5 * (_products(gradient_v, frame) - across_v * gain)
+    across_u, across_v = free[:, 0, 1], free[:, 0, 2]
+    # Differences over two pixels are twice the slopes.
+    H_uu = 0.25 * (free[:, 1, 1] - across_u**2 / power)
+    H_uv = 0.25 * (free[:, 1, 2] - across_u * across_v / power)
+    H_vv = 0.25 * (free[:, 2, 2] - across_v**2 / power)
+    b_u, b_v = 0.5 * (frame_u - across_u * gain), 0.5 * (frame_v - across_v * gain)
     determinant = H_uu * H_vv - H_uv**2
     usable = (determinant > 1e-6 * (H_uu + H_vv) ** 2) & (gain > 0.1)
     safe = np.where(usable, determinant * gain, 1.0)
@@ -282,7 +322,3 @@ def _step(frame: Singles, energy: Floats, template: Singles) -> tuple[Floats, Fl
     dv = (H_uu * b_v - H_uv * b_u) / safe
     step = np.where(usable[:, None], np.clip(-STEP_GAIN * np.stack([du, dv], axis=1), -2.0, 2.0), 0.0)
     return step, np.where(usable, score, 0.0)
-
-
-def _products(left: Singles, right: Singles) -> Floats:
-    return np.asarray(np.vecdot(left, right), dtype=np.float64)

@@ -20,7 +20,7 @@ from core.project import Method, Project, Target
 from core.storage import File, content_identity
 
 # Raised whenever the same video would be measured differently: older recordings are then not continued.
-MEASURE_VERSION = 8
+MEASURE_VERSION = 9
 # Over a longer gap nothing goes on as it was, and the last place is as good a guess as any.
 MOST_STEPS = 2.0
 

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from core.coordinates import Floats
 from core.errors import InputError
-from core.robust import finite_median
 from core.video import Luma
 
 Singles = NDArray[np.float32]
@@ -31,6 +30,8 @@ LEAST_EDGE = 1.5
 # Correlation of the cross profile below which something else lies in the band.
 LEAST_CORRELATION = 0.5
 HALLEY_STEPS = 3
+# How far an edge may lie beside its strip's mid-line and all of the kernel still falls on pixels, pixels.
+ASIDE_PX = 2
 # The two edges of a strip, on either side of its mid-line.
 SIDES = np.array([[-1.0], [1.0]])
 # Parts of a band whose cross profiles are compared one by one, so that one hidden part does not decide.
@@ -197,7 +198,7 @@ class LineTracker:
         signature = self.profile.signature
         reach = search + (len(signature) - 1) // 2
         first = np.arange(QUARTERS) * len(fraction) // QUARTERS
-        count = np.diff(first, append=len(fraction))
+        count = np.append(first[1:], len(fraction)) - first
         middle = np.add.reduceat(fraction, first) / count
         columns = section.half + np.rint(middle).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
         mean = np.add.reduceat(section.values, first, axis=0, dtype=np.float64) / count[:, None]
@@ -208,7 +209,7 @@ class LineTracker:
         # Among equals the nearest wins; a look-alike must be clearly better to be preferred.
         best = int(np.argmax(score - 0.1 * (shifts / max(search, 1)) ** 2))
         inner = min(max(best, 1), 2 * search - 1)
-        vertex = np.clip([_vertex(row, inner) - best for row in scores], -1.0, 1.0)
+        vertex = np.clip(_vertex(scores.T, inner) - best, -1.0, 1.0)
         return float(shifts[best] + _median_of_quarters(vertex + np.rint(middle) - middle)), float(score[best])
 
 
@@ -237,8 +238,11 @@ class _Strip:
         count = members.sum(axis=1)
         filled = np.maximum(count, 1e-9)
         along, middle = members @ self.section.along / filled, members @ self.line / filled
-        wanted = 0.5 * finite_median(np.where(count > 0, count, np.nan))
-        good = (count >= wanted) & (np.abs(shift) < profile.capture_px) & (strength > 0.25 * profile.edge)
+        good = (
+            (count >= 0.5 * np.median(count[count > 0]))
+            & (np.abs(shift) < profile.capture_px)
+            & (strength > 0.25 * profile.edge)
+        )
         found = np.full((STATIONS, 2, 2), np.nan)
         found[..., axis] = np.where(good, along, np.nan).T
         found[..., 1 - axis] = np.where(good, middle + SIDES * profile.width_px / 2 + shift, np.nan).T
@@ -317,24 +321,25 @@ def _extremes(strips: Sequence[_Strip]) -> tuple[Floats, Floats]:
     columns = [len(strip.line) for strip in strips]
     values, start, width = _side_by_side([strip.section for strip in strips])
     expected = np.concatenate([_expected_edges(strip) for strip in strips], axis=1)
-    scale = np.repeat([strip.profile.scale_px for strip in strips], columns)
-    half = int(np.ceil(3.0 * scale.max())) + 1
+    scales = np.array([strip.profile.scale_px for strip in strips])
+    # Pixels about where the edge is expected are taken once, with room for an edge that lies beside that.
+    half = int(np.ceil(3.0 * scales.max())) + ASIDE_PX
+    nearest = np.clip(np.rint(expected).astype(np.int64), half, width - 1 - half)
     taps = np.arange(-half, half + 1)
-    powers = (taps[:, None] ** np.arange(5)).astype(np.float32)
-    distance = (taps / scale[:, None]).astype(np.float32)
-    units = (scale ** -np.arange(5)[:, None]).astype(np.float32)[:, None]
+    sample = values.take(start + nearest + taps[:, None, None])
+    powers = (taps ** np.arange(5)[:, None]).astype(np.float32)
+    scale = np.repeat(scales, columns)
+    distance = (taps[:, None, None] / scale).astype(np.float32)
+    units = np.repeat((scales ** -np.arange(5.0)[:, None]).astype(np.float32), columns, axis=1)[:, None]
     pooling = [strip.members.astype(np.float32) for strip in strips]
-    by_station = np.array([strip.profile.scale_px for strip in strips])[:, None, None]
+    by_station = scales[:, None, None]
     slope_sign = -SIDES * np.array([strip.profile.polarity for strip in strips])[:, None, None]
     shift = np.zeros((len(strips), 2, STATIONS))
     for _ in range(HALLEY_STEPS):
-        position = expected + _to_columns(shift, pooling)
-        nearest = np.clip(np.rint(position).astype(np.int64), half, width - 1 - half)
-        sample = values.take((start + nearest)[..., None] + taps)
-        past = ((nearest - position) / scale).astype(np.float32)
-        gauss = np.exp(-0.5 * (past[..., None] + distance) ** 2)
-        own = units[:3] * _moments(gauss, powers[:, :3])
-        by_column = _responses(past, units * _moments(gauss * sample, powers), own)
+        past = ((nearest - expected - _to_columns(shift, pooling)) / scale).astype(np.float32)
+        gauss = np.exp(-0.5 * (past + distance) ** 2)
+        own = units[:3] * _moments(powers[:3], gauss)
+        by_column = _responses(past, units * _moments(powers, gauss * sample), own)
         response, first, second, third, power = _to_stations(by_column, pooling)
         strength = slope_sign * response / np.maximum(power * by_station, 1e-9)
         curved = second * slope_sign < 0
@@ -374,10 +379,9 @@ def _to_stations(by_column: Singles, pooling: Sequence[Singles]) -> Floats:
     return np.stack(sums, axis=1).astype(np.float64)
 
 
-def _moments(weighted: Singles, powers: Singles) -> Singles:
-    """Return the sums (P, 2, n) of weights (2, n, taps) times powers (taps, P)."""
-    sums = weighted.reshape(-1, len(powers)) @ powers
-    return np.ascontiguousarray(sums.T).reshape(-1, *weighted.shape[:2])
+def _moments(powers: Singles, weighted: Singles) -> Singles:
+    """Return the sums (P, 2, n) of powers (P, taps) times weights (taps, 2, n)."""
+    return (powers @ weighted.reshape(len(weighted), -1)).reshape(-1, *weighted.shape[1:])
 
 
 def _responses(past: Singles, moments: Singles, own: Singles) -> Singles:
@@ -452,7 +456,7 @@ def _edge_pairs(profile: Singles, half_band: int) -> list[tuple[float, float, fl
         and abs(gradient[i]) >= abs(gradient[i - 1])
         and abs(gradient[i]) > abs(gradient[i + 1])
     ]
-    refined = [(_vertex(np.abs(gradient), i), gradient[i]) for i in peaks]
+    refined = [(float(_vertex(np.abs(gradient), i)), gradient[i]) for i in peaks]
     widest = max(8.0, half_band * 0.9)
     found = []
     for number, (left, rise) in enumerate(refined):
@@ -469,6 +473,8 @@ def _edge_pairs(profile: Singles, half_band: int) -> list[tuple[float, float, fl
     return found
 
 
-def _vertex(values: Floats, i: int) -> float:
+def _vertex(values: Floats, i: int) -> Floats:
+    """Return where the parabola through three neighbours along the first axis has its vertex, `i` the middle one."""
     curvature = values[i - 1] - 2 * values[i] + values[i + 1]
-    return float(i) if curvature == 0 else i + 0.5 * (values[i - 1] - values[i + 1]) / curvature
+    flat = curvature == 0
+    return np.asarray(i + np.where(flat, 0.0, 0.5 * (values[i - 1] - values[i + 1]) / np.where(flat, 1.0, curvature)))

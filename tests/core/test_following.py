@@ -99,3 +99,14 @@ def test_noisy_points_are_compared_with_a_mean_of_views() -> None:
     found = points.find(seen((3.4, -2.2)), np.eye(3), Apparent(np.array([3.0, -2.0]) / FOCAL_PX, 0.0), confirm=False)
     np.testing.assert_allclose(shift_px(found.apparent), [3.4, -2.2], atol=0.1)
     assert np.isfinite(found.raw).all(axis=1).mean() > 0.8
+
+
+def test_lines_partly_hidden_or_mistaken_still_say_where_to_look_next() -> None:
+    covered = np.roll(roof(), (3, -2), axis=(0, 1)).copy()
+    covered[140:165, 170:205] = 90
+    found = follower().find(covered, np.eye(3), Apparent.none(), confirm=False)
+    assert np.isnan(found.raw[0]).any()
+    np.testing.assert_allclose(shift_px(found.apparent), [-2.0, 3.0], atol=0.3)
+    without = roof().copy()
+    without[:, 225:275] = roof()[:, 285:335]  # nothing of T1: what happens along L1 and L2 is not known
+    assert follower().find(without, np.eye(3), Apparent.none(), confirm=False).apparent is None

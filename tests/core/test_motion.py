@@ -13,7 +13,6 @@ from core.motion import (
     is_determined_as_whole,
     rigid_from_lines,
     rigid_from_points,
-    rough_rigid_from_lines,
 )
 
 CENTRE = np.array([3.0, -2.0])
@@ -209,25 +208,3 @@ def test_a_glimpse_of_a_line_determines_nothing() -> None:
     normal = rigid_from_lines(points, np.ones(points.shape[:3]), lines()).normal
     assert is_determined(normal)[3]
     np.testing.assert_array_equal(is_determined_as_whole(normal, normal[0]), [True, True, True, False, True, True])
-
-
-@given(SHIFTS, st.floats(-0.05, 0.05))
-def test_rough_motion_is_the_exact_one_without_noise(shift: Floats, angle: float) -> None:
-    points = moved(stations(), shift, angle)
-    found = rough_rigid_from_lines(points, lines(), shift + [0.03, -0.02], angle + 2e-3)
-    np.testing.assert_allclose(found.shift[0], shift, atol=1e-4)
-    assert found.rotation_rad[0] == pytest.approx(angle, abs=1e-4)
-
-
-def test_rough_motion_is_not_drawn_away_by_a_few_strangers() -> None:
-    points = moved(stations(), np.array([0.2, 0.1]), 0.01)
-    points[:, ::4] += 0.4
-    points[1, 5:14] = np.nan
-    found = rough_rigid_from_lines(points, lines(), np.array([0.18, 0.12]), 0.0)
-    np.testing.assert_allclose(found.shift[0], [0.2, 0.1], atol=0.01)  # lines are looked for within 0.14 m
-
-
-def test_rough_motion_along_unseen_lines_is_undetermined() -> None:
-    points = stations().copy()
-    points[2] = np.nan
-    assert not is_determined(rough_rigid_from_lines(points, lines(), np.zeros(2), 0.0).normal)[0]
