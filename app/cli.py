@@ -260,9 +260,9 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument(
         "--workers",
         type=_positive_number,
-        default=1,
         metavar="N",
-        help="measure in up to N processes at once (default 1): as many as cores and the clip's length repay",
+        help="measure in up to N processes at once: as many as the clip's length repays; without it, one for every two "
+        "cores, up to four",
     )
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="measure on the workers of this Dask scheduler (rooftrack[cluster])"

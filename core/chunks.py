@@ -22,10 +22,13 @@ WARM_UP = 8
 LEAST_FRAMES = 30
 # Frames that a process measures while those that help it are still loading.
 HEAD_START = 18
-# One process keeps two cores busy, decoding and measuring. Others that find no idle cores gain little, and repay their
-# start only by so many frames.
+# One process keeps two cores busy, decoding and measuring. Others repay their start by so many frames; where they find
+# no idle cores they gain little, and it takes more.
 CORES_EACH = 2
+REPAYING_FRAMES_IDLE = 100
 REPAYING_FRAMES = 500
+# So many processes are started unasked: each takes half a gigabyte at 4K, and more would wait for the decoder's cores.
+USUAL_PROCESSES = 4
 
 
 @dataclass(frozen=True)
@@ -36,9 +39,12 @@ class Chunk:
     stop: int
 
 
-def processes_for(frames: int, workers: int, cores: int) -> int:
-    """Return how many of `workers` processes measure so many frames in the shortest time."""
-    return min(workers, max(1, cores // CORES_EACH, frames // REPAYING_FRAMES))
+def processes_for(frames: int, workers: int | None, cores: int) -> int:
+    """Return how many of `workers` processes measure so many frames in the shortest time; None for a few at most."""
+    idle = min(cores // CORES_EACH, frames // REPAYING_FRAMES_IDLE)
+    if workers is None:
+        return max(1, min(USUAL_PROCESSES, idle))
+    return min(workers, max(1, idle, frames // REPAYING_FRAMES))
 
 
 def missing_chunks(done: Sequence[int], index: FrameIndex, parts: int, head_start: int = 0) -> list[Chunk]:

@@ -204,7 +204,7 @@ def measure(
     setup: MeasureSetup,
     store: MeasurementStore,
     *,
-    workers: int = 1,
+    workers: int | None = None,
     scheduler: str | None = None,
     fresh: bool = False,
     progress: Progress = silent,
@@ -213,7 +213,8 @@ def measure(
     """Measure what is still missing of a video, resuming where an earlier run stopped; return the recording's number.
 
     Args:
-        workers: processes on this machine, this one among them; of a short clip, no more than repay their start.
+        workers: processes on this machine at most, this one among them: as many as its cores keep busy and the clip's
+            length repays; None for as many as that without being asked.
         scheduler: address of a Dask scheduler whose workers measure instead.
         fresh: forget what was measured before.
 
@@ -230,14 +231,16 @@ def measure(
     with ExitStack() as stack:
         # While the reference frame is still looked at, others load and the first chunk is being decoded.
         cluster = stack.enter_context(Cluster(measure_remotely, scheduler)) if scheduler is not None else None
-        processes = processes_for(len(index) - len(done), workers, available_cores())
+        cores = available_cores()
+        processes = processes_for(len(index) - len(done), workers, cores)
         chunks = missing_chunks(done, index, processes, HEAD_START) if cluster is None else []
         before = [_before(store, recording, chunk.start) for chunk in chunks]
         helping = max(0, min(processes, len(chunks)) - 1)
         helpers = stack.enter_context(Helpers(measure_order, helping))
+        threads = max(1, cores // (1 + helping)) if helping else 0
         decoding = None
         if recording is None and cluster is None:
-            decoding = stack.enter_context(FramesAhead(setup.video, threads=min(helping, 1), index=index))
+            decoding = stack.enter_context(FramesAhead(setup.video, threads=threads, index=index))
         reference = None if recording is None else store.reference(recording)
         measurer = make_measurer(setup, reference, index, decoding)
         if recording is None:
@@ -250,13 +253,13 @@ def measure(
                 order.chunk,
                 measurer=measurer,
                 before=order.before,
-                threads=min(helping, 1),
+                threads=order.threads,
                 index=index,
                 decoding=decoding if order.chunk == chunks[0] else None,
             )
 
         if cluster is None:
-            orders = [Order(prepared, chunk, known) for chunk, known in zip(chunks, before, strict=True)]
+            orders = [Order(prepared, chunk, known, threads) for chunk, known in zip(chunks, before, strict=True)]
             source = helpers.measure(orders, own)
         else:
             source = cluster.measure(prepared, lambda parts: missing_chunks(done, index, parts), len(index))
@@ -316,7 +319,7 @@ _kept = _Kept()
 
 
 def measure_order(order: Order) -> Iterator[FrameMeasurement]:
-    """Yield the measurements of one chunk; runs in a helping process or on a worker, on one core."""
+    """Yield the measurements of one chunk; runs in a helping process or on a worker, beside others."""
     # Libraries that start threads of their own would only get in each other's way.
     cv2.setNumThreads(1)
     if _kept.packed != order.prepared:
@@ -327,7 +330,7 @@ def measure_order(order: Order) -> Iterator[FrameMeasurement]:
         order.chunk,
         measurer=_kept.prepared.measurer,
         before=order.before,
-        threads=1,
+        threads=order.threads,
         index=_kept.prepared.index,
     )
 

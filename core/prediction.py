@@ -7,17 +7,21 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from core.coordinates import Floats, apply_homography, invert_homography
 from core.errors import InputError
 from core.following import Apparent
-from core.georeference import ReferenceFit
 from core.lens import Lens
 from core.measurements import FrameMeasurement, Reference
 from core.project import Method, Project, Target
 from core.storage import File, content_identity
+
+if TYPE_CHECKING:
+    # Brings a library along that takes a while to load, which workers that only measure are spared.
+    from core.georeference import ReferenceFit
 
 # Raised whenever the same video would be measured differently: older recordings are then not continued.
 MEASURE_VERSION = 9

@@ -93,7 +93,7 @@ class RunSummary:
 def run_project(
     folder: Path,
     *,
-    workers: int = 1,
+    workers: int | None = None,
     scheduler: str | None = None,
     fresh: bool = False,
     progress: Progress = silent,
@@ -102,7 +102,7 @@ def run_project(
     """Measure what is missing, solve, and write all results of a project folder.
 
     Args:
-        workers: processes that measure side by side.
+        workers: processes that measure side by side, as `core.measure.measure`.
         scheduler: address of a Dask scheduler whose workers measure instead.
         fresh: forget earlier measurements of this method.
 

@@ -232,11 +232,13 @@ def _solve_target(
     origin_m: Floats,
 ) -> TargetSolution:
     body, points = _on_plane(recording, target, used, ground, z_m=used.heights_m[target.name])
-    still = during(recording.time_s, project.intervals_s.pre_event)
+    intervals = project.intervals_s
+    still, after = (during(recording.time_s, part) for part in (intervals.pre_event, intervals.residual))
     fit = body.fit(points, still & ground.usable)
     used_points = (fit.weight > 0.1).reshape(len(fit.weight), -1).sum(axis=1)
     status = frame_status(recording, project, ground, points_used=used_points, determined=body.is_determined(fit))
-    at_rest = still & np.isin(status, MEASURED)
+    is_measured = np.isin(status, MEASURED)
+    at_rest = still & is_measured
     moved = np.stack([fit.at(place, body.centre) for place in body.places], axis=1)
     start_m, start_rad = (
         (moved[at_rest].mean(axis=0), fit.rotation_rad[at_rest].mean()) if at_rest.any() else (np.zeros((2, 2)), 0.0)
@@ -250,7 +252,8 @@ def _solve_target(
         places_m=places,
         rotation_rad=rotation,
         still=at_rest,
-        moving=~(still | during(recording.time_s, project.intervals_s.residual)),
+        moving=~(still | after),
+        after=after & is_measured,
     )
     raw_m, raw_rad = _without_parallax_correction(recording, target, used, ground)
     history = TargetHistory(

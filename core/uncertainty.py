@@ -33,6 +33,9 @@ SECOND_DIFFERENCE = np.sqrt(6.0)
 # noise: standard deviations are then widened by the root of what is missing (2 sigma held 66 % in clips of 2 frames and
 # 85 % in clips of 14; widened they hold 90 to 97 %).
 LEAST_STILL = 30
+# After the event light and encoder may err more than before it: standard deviations there are widened up to this by
+# their own scatter. What scatters more than that is no error but motion.
+MOST_AFTER = 3.0
 # Bounds of the correction by the scatter at rest: beyond them something other than random error is at work.
 LEAST_FACTOR, MOST_FACTOR = 0.3, 8.0
 
@@ -86,6 +89,7 @@ def combined_sigma(
     rotation_rad: Floats,
     still: Bools,
     moving: Bools,
+    after: Bools,
 ) -> Sigma:
     """Return the standard deviation of each frame's values.
 
@@ -97,6 +101,7 @@ def combined_sigma(
         places_m: (F, 2, 2) displacements and rotation_rad (F,) whose scatter at rest is looked at.
         still: (F,) measured frames of the stationary part.
         moving: (F,) frames in no part in which the building stands still.
+        after: (F,) measured frames of the part in which it stands still again.
     """
     random = np.sqrt(points.places_m**2 + camera_m[:, None, :] ** 2 + shared_m[:, None, None] ** 2)
     factor, rotation_factor = np.ones((2, 2)), 1.0
@@ -104,8 +109,22 @@ def combined_sigma(
         factor = _by_scatter(np.hypot(random, slow_m)[still], places_m[still], MOST_FACTOR)
         rotation_factor = float(_by_scatter(points.rotation_rad[still], rotation_rad[still], MOST_FACTOR))
     wider = np.where(moving, MOVING, 1.0) * np.sqrt(max(1.0, LEAST_STILL / len(moving)))
-    places_sigma = np.sqrt((random * factor) ** 2 + slow_m**2)
-    return Sigma(places_sigma * wider[:, None, None], points.rotation_rad * rotation_factor * wider)
+    places_sigma = np.sqrt((random * factor) ** 2 + slow_m**2) * wider[:, None, None]
+    rotation_sigma = points.rotation_rad * rotation_factor * wider
+    return Sigma(
+        _widened_after(places_sigma, places_m, after),
+        _widened_after(rotation_sigma, rotation_rad, after),
+    )
+
+
+def _widened_after(sigma: Floats, value: Floats, after: Bools) -> Floats:
+    """Return standard deviations (F, ...) of values, no smaller than what they scatter by where the building rests."""
+    if after.sum() < LEAST_STILL:
+        return sigma
+    factor = _by_scatter(sigma[after], value[after], np.inf)
+    widened = sigma.copy()
+    widened[after] *= np.where(factor <= MOST_AFTER, np.maximum(factor, 1.0), 1.0)
+    return widened
 
 
 def _by_scatter(sigma: Floats, value: Floats, most: float) -> Floats:

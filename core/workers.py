@@ -26,11 +26,13 @@ class Order:
     Attributes:
         prepared: a `PreparedVideo` of `core.measure`, packed; the same for all chunks of a video.
         before: the last two frames before the chunk, where known.
+        threads: of the decoder.
     """
 
     prepared: bytes
     chunk: Chunk
     before: Sequence[FrameMeasurement] = ()
+    threads: int = 1
 
 
 # Measures the frames of an order one after another; helpers import it by name.

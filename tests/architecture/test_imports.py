@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -76,3 +78,11 @@ def test_a_right_import_is_not(tmp_path: Path, file: str, source: str) -> None:
     place.parent.mkdir(parents=True)
     place.write_text(source, encoding="utf-8")
     assert violations(tmp_path) == []
+
+
+def test_a_process_that_only_measures_loads_no_library_for_it_in_vain() -> None:
+    """Helpers and workers of a cluster start while the reference frame is looked at, and scipy takes half a second."""
+    code = "import sys, core.measure; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, check=True, text=True).stdout
+    assert {"cv2", "av", "numpy"} <= set(loaded.split())
+    assert not {"scipy", "open3d", "distributed", "fastapi", "matplotlib"} & set(loaded.split())

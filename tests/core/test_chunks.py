@@ -65,9 +65,16 @@ def test_nothing_is_missing_when_all_is_done():
         (2 * REPAYING_FRAMES, 2, 2, 2),
         (2 * REPAYING_FRAMES, 8, 2, 2),
         (300, 2, 4, 2),
-        (300, 8, 8, 4),
+        (400, 8, 8, 4),
+        (200, 8, 8, 2),
         (300, 1, 64, 1),
         (0, 2, 1, 1),
+        (10_000, None, 1, 1),
+        (10_000, None, 2, 1),
+        (10_000, None, 4, 2),
+        (10_000, None, 64, 4),
+        (250, None, 64, 2),
+        (60, None, 64, 1),
     ],
 )
 def test_no_process_is_started_that_does_not_repay_it(frames, workers, cores, processes):
