@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import Any
 
@@ -32,27 +33,14 @@ class Cluster:
     Args:
         work: what a task does.
         scheduler: address, such as `tcp://127.0.0.1:8786`.
-
-    Raises:
-        InputError: Dask is not installed, or no scheduler answers.
     """
 
     def __init__(self, work: ChunkWork, scheduler: str) -> None:
-        try:
-            from distributed import Client
-        except ImportError:
-            raise InputError("--scheduler needs Dask; install it with `pip install rooftrack[cluster]`.") from None
-        try:
-            self._client: Any = Client(scheduler, timeout=10, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise InputError(
-                f"--scheduler {scheduler}: no Dask scheduler answers there ({error}); start one."
-            ) from None
         self._work = work
-        # Nobody waits for these: a worker that is not there any more, or not yet, loads with its first task.
-        self._loading = [
-            self._client.submit(_load, work, workers=[worker], pure=False) for worker in self._client.nthreads()
-        ]
+        self._scheduler = scheduler
+        # Dask itself takes a while to load, during which this process has other things to do.
+        self._connecting = ThreadPoolExecutor(1)
+        self._connection = self._connecting.submit(self._connect)
 
     def __enter__(self) -> Cluster:
         return self
@@ -60,7 +48,32 @@ class Cluster:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._client.close()
+        self._connecting.shutdown()
+        if self._connection.exception() is None:
+            self._connection.result().close()
+
+    def _connect(self) -> Any:
+        try:
+            from distributed import Client
+        except ImportError:
+            raise InputError("--scheduler needs Dask; install it with `pip install rooftrack[cluster]`.") from None
+        try:
+            client: Any = Client(self._scheduler, timeout=10, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"--scheduler {self._scheduler}: no Dask scheduler answers there ({error}); start one."
+            ) from None
+        # Nobody waits for these: a worker that is not there any more, or not yet, loads with its first task.
+        self._loading = [client.submit(_load, self._work, workers=[worker], pure=False) for worker in client.nthreads()]
+        return client
+
+    def require(self) -> None:
+        """Wait for the connection.
+
+        Raises:
+            InputError: Dask is not installed, or no scheduler answers.
+        """
+        self._connection.result()
 
     def measure(
         self, prepared: bytes, divide: Callable[[int], Sequence[Chunk]], frames: int
@@ -74,7 +87,7 @@ class Cluster:
         """
         from distributed import as_completed
 
-        client = self._client
+        client = self._connection.result()
         chunks = longest_first(divide(tasks_for(frames, sum(client.nthreads().values()))))
         futures = [client.submit(self._work, prepared, chunk, pure=False, retries=RETRIES) for chunk in chunks]
         try:

@@ -243,6 +243,8 @@ def measure(
             decoding = stack.enter_context(FramesAhead(setup.video, threads=threads, index=index))
         reference = None if recording is None else store.reference(recording)
         measurer = make_measurer(setup, reference, index, decoding)
+        if cluster is not None:
+            cluster.require()
         if recording is None:
             recording = store.begin(setup.method, setup.fingerprint, measurer.reference)
         prepared = pickle.dumps(PreparedVideo(setup, index, measurer))

@@ -17,6 +17,7 @@ import pytest
 
 from app import cli
 from core import cluster as tasks
+from core.measurements import MeasurementStore, Reference
 from core.project import read_project
 from core.results import read_history_csv
 from core.run import FRAMES_FILE, load_inputs
@@ -131,9 +132,14 @@ def test_workers_read_videos_from_where_they_are_stored(clip, sequential, cluste
     assert hashlib.sha256((clip / "video.mp4").read_bytes()).hexdigest() in summary
 
 
-def test_a_scheduler_that_is_not_there_is_named(clip, tmp_path, capsys):
+def test_a_scheduler_that_is_not_there_is_named_and_nothing_is_lost_to_it(clip, tmp_path, capsys):
     folder = project_copy(clip, tmp_path / "clip")
+    inputs = load_inputs(folder)
+    with MeasurementStore(folder / "results" / FRAMES_FILE) as store:
+        store.begin(inputs.setup().method, "of another day", Reference(np.zeros((4, 2)), {}))
     assert cli.main(["run", str(folder), "--scheduler", "tcp://127.0.0.1:9"]) == 1
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert "tcp://127.0.0.1:9" in said
     assert "no Dask scheduler answers" in said
+    with MeasurementStore(folder / "results" / FRAMES_FILE) as store:
+        assert store.find(inputs.setup().method, "of another day") is not None
