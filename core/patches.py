@@ -224,17 +224,17 @@ class PatchTracker:
             Scalar products (n, 3, 5) of the reference and of its differences over two pixels along u and v with those
             three, with the frame and with ones.
         """
-        W = TEMPLATE_SIDE
+        width = TEMPLATE_SIDE
         products = np.empty((len(frame), 3, 5), np.float32)
-        work = np.ones((min(BLOCK, len(frame)), 5, SIDE * W), np.float32)
+        work = np.ones((min(BLOCK, len(frame)), 5, SIDE * width), np.float32)
         for block in batches(len(frame), BLOCK):
             maps = coefficients[block] @ self._grid
             # A patch is one long row of all its rows. Differences across the seams fall into the outer columns.
             rows = cv2.remap(mosaic, maps[:, 0], maps[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             part = work[: len(rows)]
-            np.multiply(rows[:, W:-W], _INNER_COLUMNS, out=part[:, 0])
-            np.subtract(rows[:, W + 1 : 1 - W], rows[:, W - 1 : -W - 1], out=part[:, 1])
-            np.subtract(rows[:, 2 * W :], rows[:, : -2 * W], out=part[:, 2])
+            np.multiply(rows[:, width:-width], _INNER_COLUMNS, out=part[:, 0])
+            np.subtract(rows[:, width + 1 : 1 - width], rows[:, width - 1 : -width - 1], out=part[:, 1])
+            np.subtract(rows[:, 2 * width :], rows[:, : -2 * width], out=part[:, 2])
             part[:, 1:3] *= _INNER_COLUMNS
             part[:, 3] = frame[block]
             np.matmul(part[:, :3], part.mT, out=products[block])

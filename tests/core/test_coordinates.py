@@ -12,6 +12,7 @@ from core.coordinates import (
     batches,
     evenly_spread,
     finite_rows,
+    invert_2x2,
     invert_homography,
     read_only,
     rotation_2d,
@@ -91,3 +92,8 @@ def test_an_orthoimage_is_north_up_and_counted_from_pixel_centres() -> None:
     corners = apply_homography(grid.H_world_ortho, [[0.0, 0.0], [39.0, 19.0]])
     np.testing.assert_allclose(corners, [[100.25, 249.75], [119.75, 240.25]])
     np.testing.assert_allclose(grid.H_ortho_world @ grid.H_world_ortho, np.eye(3), atol=1e-12)
+
+
+def test_small_matrices_are_inverted_all_at_once() -> None:
+    matrices = np.random.default_rng(2).normal(size=(5, 40, 2, 2))
+    np.testing.assert_allclose(invert_2x2(matrices), np.linalg.inv(matrices), rtol=1e-9)
