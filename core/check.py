@@ -18,6 +18,7 @@ from core.coordinates import Floats, is_in_frame
 from core.drift import corner_obstacle
 from core.errors import InputError
 from core.georeference import ReferenceFit, fit_reference
+from core.gps_record import read_gps
 from core.ground_plane import fit_ground_plane
 from core.intervals import within
 from core.lens import Lens, read_lens, require_image_size
@@ -37,7 +38,6 @@ from core.project import (
 )
 from core.roof_level import height_obstacle, scale_obstacle
 from core.storage import File, file_at
-from core.validation import read_gps
 from core.video import FrameIndex, VideoInfo, frame_index, probe
 
 # Lines that cross at a smaller angle have an intersection that runs along both with every small error.

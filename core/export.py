@@ -20,6 +20,7 @@ from core.camera import PoseFit, project
 from core.coordinates import Bools, Floats
 from core.drift import filter_warnings
 from core.flight import SmoothFlight
+from core.gps_record import GpsRecord
 from core.lens import Lens
 from core.measurements import Recording
 from core.motion import LineSet, fit_line
@@ -38,7 +39,7 @@ from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution
 from core.solve import filtered, unfiltered_history
 from core.storage import File, write_atomically
-from core.validation import GpsComparison, GpsRecord, compare_with_gps
+from core.validation import GpsComparison, compare_with_gps
 from core.video import read_frame
 
 SUMMARY_FILE = "summary.json"

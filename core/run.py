@@ -20,6 +20,7 @@ from core.coordinates import Floats
 from core.errors import InputError
 from core.export import Results, write_results
 from core.georeference import ReferenceFit
+from core.gps_record import GpsRecord, read_gps
 from core.ground_plane import GroundPlane, fit_ground_plane
 from core.ground_poses import fit_with_relief
 from core.lens import Lens, read_lens, require_image_size
@@ -33,7 +34,6 @@ from core.project import PROJECT_FILE, RESULTS_FOLDER, Project, naming_file, rea
 from core.relief import Relief, rasterise
 from core.solve import solve
 from core.storage import File, content_identity, file_at, opened, state_of, write_atomically
-from core.validation import GpsRecord, read_gps
 from core.version import program_version
 from core.video import VideoInfo, frame_index, probe
 

@@ -15,12 +15,12 @@ import pytest
 from core import export
 from core.errors import InputError
 from core.export import Results, fitted_lines, write_results
+from core.gps_record import GpsRecord
 from core.project import Project
 from core.report import ReportFigure
 from core.results import read_history_csv
 from core.solution import Solution
 from core.solve import solve
-from core.validation import GpsRecord
 from tests import exact_scene as scene
 from tests.small_project import write_video
 
