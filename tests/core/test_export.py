@@ -57,6 +57,7 @@ def results(video: Path, project: Project, solution: Solution, **changes: Any) -
         solution=solution,
         gps=None,
         video=video,
+        announced_s=scene.FRAMES / scene.RATE_HZ,
         sha256={"video.mp4": "ab" * 32, "lens.yaml": "cd" * 32, "gps.csv": "ef" * 32},
         identity={"video.mp4": "12" * 32, "lens.yaml": "34" * 32, "gps.csv": "56" * 32},
         version="0.1.0",
@@ -315,3 +316,11 @@ def test_lines_are_drawn_where_they_lie() -> None:
 def test_nothing_is_drawn_with_before_it_must_be() -> None:
     code = "import sys, core.export; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=False).returncode == 0
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_video_that_ends_before_it_says_is_told(video: Path, tmp_path: Path) -> None:
+    made = results(video, scene.project_document(), solved(), announced_s=scene.FRAMES / scene.RATE_HZ + 2)
+    warnings = write_results(tmp_path, made)["warnings"]
+    assert warnings[0].startswith("video.mp4: says that it lasts")
+    assert warnings[0].endswith("as in a file that was cut off; copy it again.")
