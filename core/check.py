@@ -38,6 +38,7 @@ from core.project import (
 )
 from core.roof_level import height_obstacle, scale_obstacle
 from core.storage import File, file_at
+from core.text_files import decoded
 from core.video import FrameIndex, VideoInfo, frame_index, probe
 
 # Lines that cross at a smaller angle have an intersection that runs along both with every small error.
@@ -132,7 +133,7 @@ def _time_obstacles(project: Project, index: FrameIndex) -> Iterator[str]:
 def _problems_of_file(file: Path) -> list[str]:
     """Return the problems of a `project.json` one by one; none where it cannot be parsed at all."""
     try:
-        document = json.loads(file.read_text(encoding="utf-8-sig"))
+        document = json.loads(decoded(file.read_bytes()))
     except (OSError, ValueError, RecursionError):
         return []
     return [f"{file}: {problem}." for problem in project_problems(document)]

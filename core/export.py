@@ -7,9 +7,11 @@ were; each file takes its predecessor's place in one step, the summary last.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from core.camera import PoseFit, project
 from core.coordinates import Bools, Floats
 from core.drift import filter_warnings
+from core.errors import DISK_FULL
 from core.flight import SmoothFlight
 from core.gps_record import GpsRecord
 from core.lens import Lens
@@ -121,14 +124,36 @@ def write_results(folder: Path, results: Results, progress: Progress = silent) -
     summary = summary_of(results, check, warnings)
     figures = _draw(results, check, progress)
     histories = results.solution.histories
-    for name, history in histories.items():
-        write_history_csv(folder / f"{name}.csv", history)
-    for name, figure in figures.items():
-        write_atomically(folder / FIGURES_FOLDER / f"{name}.png", figure.png)
-    write_report(folder, _report_content(results, check=check, warnings=warnings, summary=summary, figures=figures))
+    with _all_or_none(folder) as made:
+        for name, history in histories.items():
+            write_history_csv(made / f"{name}.csv", history)
+        for name, figure in figures.items():
+            write_atomically(made / FIGURES_FOLDER / f"{name}.png", figure.png)
+        write_report(made, _report_content(results, check=check, warnings=warnings, summary=summary, figures=figures))
+        write_summary(made / SUMMARY_FILE, summary)
     _remove_stale(folder, set(histories), set(figures))
-    write_summary(folder / SUMMARY_FILE, summary)
     return summary
+
+
+@contextmanager
+def _all_or_none(folder: Path) -> Iterator[Path]:
+    """Give a place to write into, whose files come into a folder together at the end, or not at all.
+
+    Raises:
+        OSError: there is no room for them, or something else is in their place.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with TemporaryDirectory(prefix=".being-written-", dir=folder) as made:
+            yield Path(made)
+            for file in [file for file in Path(made).rglob("*") if file.is_file()]:
+                place = folder / file.relative_to(made)
+                place.parent.mkdir(exist_ok=True)
+                file.replace(place)
+    except OSError as error:
+        if error.errno in DISK_FULL:
+            error.filename = str(folder)
+        raise
 
 
 def compared_with_gps(results: Results) -> GpsCheck | None:

@@ -251,8 +251,10 @@ def relief_plan(folder: Path, project: Project) -> ReliefPlan | None:
 def _cloud_identity(cloud_file: Path) -> str:
     try:
         return content_identity(cloud_file)
-    except OSError:
+    except FileNotFoundError:
         raise InputError(f"{cloud_file}: not found; correct inputs.cloud or put the file there.") from None
+    except OSError as error:
+        raise InputError(f"{cloud_file}: cannot be read ({error.strerror}); correct inputs.cloud.") from None
 
 
 def _relief_of(folder: Path, project: Project, progress: Progress) -> Relief | None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
@@ -324,3 +325,21 @@ def test_a_video_that_ends_before_it_says_is_told(video: Path, tmp_path: Path) -
     warnings = write_results(tmp_path, made)["warnings"]
     assert warnings[0].startswith("video.mp4: says that it lasts")
     assert warnings[0].endswith("as in a file that was cut off; copy it again.")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_results_that_find_no_room_leave_the_earlier_ones(
+    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = results(video, scene.project_document(), solved())
+    write_results(tmp_path, made)
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+
+    def no_room(path: Path, summary: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(export, "write_summary", no_room)
+    with pytest.raises(OSError, match="No space left") as refused:
+        write_results(tmp_path, replace(made, version="0.2.0"))
+    assert refused.value.filename == str(tmp_path)
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
