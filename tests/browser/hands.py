@@ -74,6 +74,16 @@ def centre_of(mark: Locator) -> Floats:
     return np.array(where)
 
 
+def finger(page: Page, start: Floats, shift: tuple[float, float]) -> None:
+    """Put one finger somewhere in the window, drag it, let go."""
+    touch = page.context.new_cdp_session(page)
+    for kind, part in (("touchStart", 0.0), *(("touchMove", part / 10) for part in range(1, 11))):
+        x, y = np.asarray(start) + part * np.array(shift)
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": float(x), "y": float(y)}]})
+    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    touch.detach()
+
+
 def pinch(page: Page, pane: Locator, spread_px: tuple[float, float], shift: tuple[float, float] = (0.0, 0.0)) -> None:
     """Put two fingers side by side about the middle of something, so far apart, and spread or shift them; let go."""
     box = pane.bounding_box()

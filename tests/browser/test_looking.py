@@ -13,9 +13,9 @@ from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
 from app.scene3d import line_colours
-from tests.browser.hands import Placement, centre_of, drawn, fitted, pinch, zoomed
+from tests.browser.hands import Placement, centre_of, drawn, finger, fitted, pinch, zoomed
 from tests.browser.live import ask, ask_bytes, eventually, free_port, serving, watched
-from tests.browser.steps import FRAME_SIZE, pane, pixels, ready
+from tests.browser.steps import FRAME_SIZE, pane, pixels, ready, saved
 
 # What each page shows last.
 SHOWN_LAST = {
@@ -194,6 +194,21 @@ def test_two_fingers_move_and_zoom_a_picture_and_place_nothing(browser, pages):
         drawn(page, frame, 3 * before.scale)
         assert page.locator("#pairs tbody tr").count() == pairs
         assert len(ask(pages, "")["project"]["correspondences"]) == pairs
+
+
+def test_a_finger_grabs_what_it_covers(browser, measured):
+    with watched(browser, measured[1], has_touch=True) as page:
+        page.goto(f"{measured[1]}/correspondences")
+        ready(page, "Reference frame")
+        frame = pane(page, "Reference frame")
+        placed = fitted(page, frame, FRAME_SIZE)
+        pair = ask(measured[1], "")["project"]["correspondences"][2]
+        beside = placed.window(np.array(pair["frame_px"])) + [-20.0, 0.0]
+        finger(page, beside, (-30.0, 24.0))
+        saved(page)
+        moved = ask(measured[1], "")["project"]["correspondences"][2]
+        by_px = placed.window(np.array(moved["frame_px"])) - placed.window(np.array(pair["frame_px"]))
+        np.testing.assert_allclose(by_px, [-30, 24], atol=0.6)
 
 
 def test_two_fingers_zoom_a_plot_and_choose_no_frame(browser, pages):

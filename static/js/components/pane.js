@@ -27,6 +27,7 @@ import { ShapeLayer, shapeAt } from "./shapes.js";
  */
 
 const STILL_PX = 3;
+const FINGER = 1.7; // a finger grabs from so many times as far as a mouse: from within 24 px, as wide as a fingertip
 const TRUE_PIXELS_FROM = 3; // device px per image px above which pixels are shown as squares
 
 /** @extends {Emitter<PaneEvents>} */
@@ -274,7 +275,8 @@ export class Pane extends Emitter {
     this.#fingers.down(event);
     if (this.#fingers.isPinch) return this.#giveUp();
     const at = canvasPoint(event, this.element);
-    const shape = event.button === 0 ? shapeAt(this.#shapes, this.view, at) : null;
+    const generosity = event.pointerType === "touch" ? FINGER : 1;
+    const shape = event.button === 0 ? shapeAt(this.#shapes, this.view, at, generosity) : null;
     this.#press = { at, last: at, moved: false, shape, from: shape?.points[0] ?? [0, 0], pointer: event.pointerId };
   }
 
