@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from app.terminal import TerminalProgress
-from core.errors import Cancelled, InputError
+from core.errors import Cancelled, InputError, disk_problem
 from core.progress import CancelToken
 from core.version import program_version
 
@@ -54,8 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout = None
         return 1
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        return _refused(f"{where}{error.strerror or error}; make it accessible, then run again.")
+        return _refused(disk_problem(error))
     except Exception as error:
         return _refused(_unexpected(error))
 

@@ -12,9 +12,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from core.errors import Cancelled, InputError
+from core.errors import DISK_FULL, OBSTRUCTED, Cancelled, InputError, disk_problem
 
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 _FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
 
 
@@ -108,11 +107,13 @@ def install_error_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(OSError)
     def _disk(request: Request, error: OSError) -> JSONResponse:
-        if error.errno in _FULL:
+        if error.errno in DISK_FULL:
             words = "The disk is full, so nothing was written; make room, then do it again."
         elif error.errno in _FORBIDDEN:
             name = Path(str(error.filename or "the project's folder")).name
             words = f"The computer does not allow writing to {name}, or reading it; allow it, then do it again."
+        elif error.errno in OBSTRUCTED:
+            words = disk_problem(error)
         else:
             raise error
         return JSONResponse(error_body(words, kind="disk"), status_code=507)

@@ -9,8 +9,8 @@ from pathlib import Path
 from app.errors import Invalid
 from core.cloud import CLOUD_SUFFIXES, TABLE_SUFFIXES
 from core.errors import InputError
+from core.gps_record import gps_columns
 from core.lens import read_lens
-from core.validation import gps_columns
 from core.video import probe
 
 # How each format of point clouds begins; the others are tables of numbers.

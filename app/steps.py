@@ -17,8 +17,8 @@ from app.store import ProjectFolder, problem_of, stored_inputs
 from app.videos import is_read_through, video_info
 from core.check import check_project
 from core.errors import InputError
+from core.gps_record import GpsRecord, read_gps
 from core.project import GpsInput, Project, project_json
-from core.validation import GpsRecord, read_gps
 from core.video import frame_index
 
 if TYPE_CHECKING:

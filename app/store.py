@@ -30,6 +30,7 @@ from core.project import (
     parse_project,
     project_json,
     project_problems,
+    read_project,
     write_project,
 )
 from core.storage import FarFile, File, file_at
@@ -223,14 +224,9 @@ class ProjectFolder:
             part.unlink(missing_ok=True)
 
     def _read(self) -> Project:
-        file = self.folder / PROJECT_FILE
-        try:
-            text = file.read_text(encoding="utf-8")
-        except FileNotFoundError:
-            raise Missing(f"{self.id}: there is no such project.", path=self.id) from None
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{file}: cannot be read ({error}); restore it from a copy.") from None
-        return parse_project(text, file)
+        if not (self.folder / PROJECT_FILE).exists():
+            raise Missing(f"{self.id}: there is no such project.", path=self.id)
+        return read_project(self.folder)
 
     def _require_newest(self, revision: int) -> None:
         saved = self.load()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TextIO
 
 from app.reporter import Reporter
-from core.errors import Cancelled, InputError
+from core.errors import Cancelled, InputError, disk_problem
 from core.progress import CancelToken
 
 
@@ -32,6 +32,8 @@ def main() -> int:
         reporter.send({"cancelled": True})
     except InputError as error:
         reporter.send({"failed": str(error)})
+    except OSError as error:
+        reporter.send({"failed": disk_problem(error)})
     except Exception as error:
         sentence = f"Rooftrack itself failed ({type(error).__name__}: {error}); its terminal tells more."
         reporter.send({"broken": sentence, "traceback": traceback.format_exc()})

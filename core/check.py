@@ -18,6 +18,7 @@ from core.coordinates import Floats, is_in_frame
 from core.drift import corner_obstacle
 from core.errors import InputError
 from core.georeference import ReferenceFit, fit_reference
+from core.gps_record import read_gps
 from core.ground_plane import fit_ground_plane
 from core.intervals import within
 from core.lens import Lens, read_lens, require_image_size
@@ -37,7 +38,7 @@ from core.project import (
 )
 from core.roof_level import height_obstacle, scale_obstacle
 from core.storage import File, file_at
-from core.validation import read_gps
+from core.text_files import decoded
 from core.video import FrameIndex, VideoInfo, frame_index, probe
 
 # Lines that cross at a smaller angle have an intersection that runs along both with every small error.
@@ -132,7 +133,7 @@ def _time_obstacles(project: Project, index: FrameIndex) -> Iterator[str]:
 def _problems_of_file(file: Path) -> list[str]:
     """Return the problems of a `project.json` one by one; none where it cannot be parsed at all."""
     try:
-        document = json.loads(file.read_text(encoding="utf-8-sig"))
+        document = json.loads(decoded(file.read_bytes()))
     except (OSError, ValueError, RecursionError):
         return []
     return [f"{file}: {problem}." for problem in project_problems(document)]

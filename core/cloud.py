@@ -23,6 +23,8 @@ from core.progress import Progress, silent
 # Tables of numbers; the others say what they are in their first bytes.
 TABLE_SUFFIXES = (".xyz", ".pts", ".txt", ".csv", ".asc")
 CLOUD_SUFFIXES = (".las", ".laz", ".ply", ".pcd", ".e57", *TABLE_SUFFIXES)
+# No coordinate on Earth is larger, not even an easting with the number of its zone before it.
+_LARGEST_M = 1e8
 _LAS_CHUNK_POINTS = 2_000_000
 # ASPRS classes of points that are no surface: low noise and high noise.
 _NOISE_CLASSES = (7, 18)
@@ -139,11 +141,11 @@ def _eight_bits(rgb: NDArray[Any]) -> NDArray[np.uint8] | None:
 def _from_table(path: Path, table: PointTable) -> Cloud:
     if not len(table.xyz):
         raise InputError(f"{path}: holds no points; export it again.")
-    finite = np.isfinite(table.xyz).all(axis=1)
-    if not finite.all():
+    on_earth = (np.abs(table.xyz) < _LARGEST_M).all(axis=1)
+    if not on_earth.all():
         raise InputError(
-            f"{path}: {np.count_nonzero(~finite)} points have coordinates that are not finite, the first is point "
-            f"{int(np.argmin(finite))} (counted from 0); remove them and export again."
+            f"{path}: {np.count_nonzero(~on_earth)} points have coordinates that are not finite or no place on Earth, "
+            f"the first is point {int(np.argmin(on_earth))} (counted from 0); remove them and export again."
         )
     return _with_precision_note(path, table)
 
@@ -197,11 +199,12 @@ def _read_las(path: Path, progress: Progress) -> Cloud:
             header = reader.header
             if not header.point_count:
                 raise InputError(f"{path}: its header says 0 points; export it again.")
+            _require_sound(path, header)
             parts = []
             for chunk in reader.chunk_iterator(_LAS_CHUNK_POINTS):
                 parts.append(_las_columns(chunk))
                 progress("cloud", sum(part["read"] for part in parts), header.point_count)
-    except InputError:
+    except (InputError, OSError):
         raise
     except Exception as error:  # laspy and lazrs raise whatever they stumble over in a damaged file
         raise InputError(f"{path}: is damaged or no LAS file ({_first_line(error)}); copy it again.") from None
@@ -217,6 +220,43 @@ def _read_las(path: Path, progress: Progress) -> Cloud:
     notes = (f"{path}: {dropped} points classified as noise were left out.",) if dropped else ()
     world_m = whole["xyz"] * header.scales + header.offsets
     return make_cloud(world_m, rgb=whole.get("rgb"), intensity=whole["intensity"], notes=notes)
+
+
+def _require_sound(path: Path, header: Any) -> None:
+    """Refuse a file whose header gives no place to its points, or that ends before them."""
+    if not (np.isfinite([header.scales, header.offsets]).all() and (header.scales > 0).all()):
+        raise InputError(f"{path}: the scales or offsets in its header are no numbers of metres; export it again.")
+    if header.are_points_compressed:
+        _require_sound_chunks(path, header)
+        return
+    held = (path.stat().st_size - header.offset_to_point_data) // header.point_format.size
+    if held < header.point_count:
+        raise InputError(
+            f"{path}: ends after {max(held, 0)} of {header.point_count} points; copy it again, it is cut off."
+        )
+
+
+def _require_sound_chunks(path: Path, header: Any) -> None:
+    """Refuse a LAZ file whose table of chunks is cut off or damaged: lazrs would give it all the memory it asks for.
+
+    The eight bytes before the points say where the table lies, or, with -1, that the last eight of the file say it.
+    The table begins with its version and how many chunks it knows; each holds a point at least.
+
+    Source: LASzip 3 file format, chunk table.
+    """
+    size = path.stat().st_size
+
+    def numbers_at(place: int, kind: str) -> NDArray[Any]:
+        if not 0 < place <= size - 8:
+            raise InputError(f"{path}: ends before the table of its compressed chunks; copy it again, it is cut off.")
+        return np.fromfile(path, dtype=kind, count=8 // np.dtype(kind).itemsize, offset=place)
+
+    (place,) = numbers_at(header.offset_to_point_data, "<i8")
+    if place == -1:
+        (place,) = numbers_at(size - 8, "<i8")
+    _, chunks = numbers_at(int(place), "<u4")
+    if chunks > header.point_count:
+        raise InputError(f"{path}: the table of its compressed chunks is damaged; copy it again.")
 
 
 def _las_columns(chunk: Any) -> dict[str, Any]:
@@ -302,7 +342,8 @@ def thin(cloud: Cloud, count: int) -> Cloud:
     random = np.random.default_rng(0)
     candidates = np.sort(random.choice(len(cloud), min(len(cloud), 6 * count), replace=False))
     points = cloud.points_m[candidates]
-    span = points.max(axis=0) - points.min(axis=0)
+    # Of all but the outermost points: a stray echo far away would leave room for nothing else.
+    span = np.ptp(np.percentile(points, (1, 99), axis=0), axis=0)
     size = max(float(np.sqrt(max(span[0] * span[1], 1e-6) / count)) / 2, 1e-3)
     while True:
         voxels = np.floor((points - points.min(axis=0)) / size).astype(np.int64)

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import os
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+OBSTRUCTED = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY)
+
 
 class InputError(Exception):
     """Input that cannot be used, said in one sentence that names the file, the place in it and the remedy.
@@ -12,3 +18,16 @@ class InputError(Exception):
 
 class Cancelled(Exception):
     """The person asked to stop; everything measured so far is kept."""
+
+
+def disk_problem(error: OSError) -> str:
+    """Return what kept a file from being written or read, in one sentence with its remedy."""
+    file = error.filename2 or error.filename
+    where = f"{os.fsdecode(file)}: " if isinstance(file, str | bytes | os.PathLike) else ""
+    if error.errno in DISK_FULL:
+        remedy = "make room on the disk"
+    elif error.errno in OBSTRUCTED:
+        remedy = "move away what lies in its place"
+    else:
+        remedy = "make it accessible"
+    return f"{where}{error.strerror or error}; {remedy}, then do it again."

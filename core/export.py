@@ -7,9 +7,11 @@ were; each file takes its predecessor's place in one step, the summary last.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,9 @@ from scipy.spatial.transform import Rotation
 from core.camera import PoseFit, project
 from core.coordinates import Bools, Floats
 from core.drift import filter_warnings
+from core.errors import DISK_FULL
 from core.flight import SmoothFlight
+from core.gps_record import GpsRecord
 from core.lens import Lens
 from core.measurements import Recording
 from core.motion import LineSet, fit_line
@@ -38,7 +42,7 @@ from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution
 from core.solve import filtered, unfiltered_history
 from core.storage import File, write_atomically
-from core.validation import GpsComparison, GpsRecord, compare_with_gps
+from core.validation import GpsComparison, compare_with_gps
 from core.video import read_frame
 
 SUMMARY_FILE = "summary.json"
@@ -60,6 +64,8 @@ CAPTIONS = {
     "gps": "Displacement at the antenna, and GPS.",
     "camera": "Drift and turns of the camera from their means.",
 }
+# Containers round, count the sound, and add how long the last frame is shown; this is more than all of that.
+_MISSING_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -73,6 +79,7 @@ class Results:
         solution: displacement and everything it rests on.
         gps: to compare with, where given.
         video: its file.
+        announced_s: how long the video lasts by what its container says.
         sha256: of each input, by its path as the project names it.
         identity: of each input, by which it is told without reading all of it whether it is still the same.
         version: of the program.
@@ -86,6 +93,7 @@ class Results:
     solution: Solution
     gps: GpsRecord | None
     video: File
+    announced_s: float
     sha256: Mapping[str, str]
     identity: Mapping[str, str]
     version: str
@@ -116,14 +124,36 @@ def write_results(folder: Path, results: Results, progress: Progress = silent) -
     summary = summary_of(results, check, warnings)
     figures = _draw(results, check, progress)
     histories = results.solution.histories
-    for name, history in histories.items():
-        write_history_csv(folder / f"{name}.csv", history)
-    for name, figure in figures.items():
-        write_atomically(folder / FIGURES_FOLDER / f"{name}.png", figure.png)
-    write_report(folder, _report_content(results, check=check, warnings=warnings, summary=summary, figures=figures))
+    with _all_or_none(folder) as made:
+        for name, history in histories.items():
+            write_history_csv(made / f"{name}.csv", history)
+        for name, figure in figures.items():
+            write_atomically(made / FIGURES_FOLDER / f"{name}.png", figure.png)
+        write_report(made, _report_content(results, check=check, warnings=warnings, summary=summary, figures=figures))
+        write_summary(made / SUMMARY_FILE, summary)
     _remove_stale(folder, set(histories), set(figures))
-    write_summary(folder / SUMMARY_FILE, summary)
     return summary
+
+
+@contextmanager
+def _all_or_none(folder: Path) -> Iterator[Path]:
+    """Give a place to write into, whose files come into a folder together at the end, or not at all.
+
+    Raises:
+        OSError: there is no room for them, or something else is in their place.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with TemporaryDirectory(prefix=".being-written-", dir=folder) as made:
+            yield Path(made)
+            for file in [file for file in Path(made).rglob("*") if file.is_file()]:
+                place = folder / file.relative_to(made)
+                place.parent.mkdir(exist_ok=True)
+                file.replace(place)
+    except OSError as error:
+        if error.errno in DISK_FULL:
+            error.filename = str(folder)
+        raise
 
 
 def compared_with_gps(results: Results) -> GpsCheck | None:
@@ -153,7 +183,7 @@ def compared_with_gps(results: Results) -> GpsCheck | None:
 
 def all_warnings(results: Results, check: GpsCheck | None) -> list[str]:
     """Return whatever an engineer must know before using the numbers, in sentences."""
-    warnings = list(results.solution.warnings)
+    warnings = [*_video_warnings(results), *results.solution.warnings]
     for target in results.project.targets:
         history = results.solution.histories[target.name]
         warnings += _measurement_warnings(history)
@@ -163,6 +193,16 @@ def all_warnings(results: Results, check: GpsCheck | None) -> list[str]:
     if check is not None:
         warnings += _gps_warnings(results.project, check)
     return warnings
+
+
+def _video_warnings(results: Results) -> list[str]:
+    last_s = float(results.recording.time_s[-1])
+    if results.announced_s - last_s < _MISSING_S:
+        return []
+    return [
+        f"{results.video.name}: says that it lasts {results.announced_s:.1f} s, but its frames end at {last_s:.1f} s, "
+        "as in a file that was cut off; copy it again."
+    ]
 
 
 def _measurement_warnings(history: TargetHistory) -> list[str]:

@@ -95,7 +95,7 @@ def fit_ground_plane(cloud: Cloud, ground_z_m: float | None = None) -> GroundPla
         raise InputError(
             "the point cloud is a cloud without ground: no surface in it is nearly horizontal over "
             f"{_min_cells(cells)} or more cells of {_GROUND_CELL_M} m; "
-            "give the whole site with z up, or set orthoimage.ground_z_m."
+            f"give the whole site, in metres with z up ({_spans(points)}), or set orthoimage.ground_z_m."
         )
     largest = max(count for _, count in surfaces)
     dominant = [plane for plane, count in surfaces if count >= _DOMINANT_SHARE * largest]
@@ -105,6 +105,11 @@ def fit_ground_plane(cloud: Cloud, ground_z_m: float | None = None) -> GroundPla
     z0 = a * middle[0] + b * middle[1] + c
     at = np.array([*middle, z0]) + cloud.origin_m
     return _described(cloud, (float(at[0]), float(at[1]), float(at[2])), (float(a), float(b)))
+
+
+def _spans(points: Floats) -> str:
+    """Say how large a cloud is, which betrays another unit and swapped axes."""
+    return "it spans " + " x ".join(f"{length:.3g}" for length in np.ptp(points, axis=0))
 
 
 def _min_cells(cells: Floats) -> int:

@@ -19,7 +19,14 @@ from numpy.typing import ArrayLike
 from core.coordinates import Floats, batches, read_only
 from core.errors import InputError
 from core.storage import File, write_atomically
+from core.text_files import decoded
 
+# A shorter focal length, as part of the longer side of the frame, sees more than 157 degrees: it is in millimetres.
+_SHORTEST_FOCAL = 0.1
+# What ROS calls k1 k2 p1 p2 k3, and the same with more that may be zero.
+_MODELS = ("plumb_bob", "rational_polynomial")
+# Rolling shutters take a few hundredths; a larger number is in milliseconds.
+_LONGEST_READOUT_S = 1.0
 # Newton's method doubles the number of right digits: after a step this small the ray is exact to 1e-13 or so.
 _LAST_STEP = 1e-7
 _MAX_STEPS = 40
@@ -234,17 +241,19 @@ def require_image_size(lens: Lens, *, width: int, height: int, lens_file: Path |
 
 
 def read_lens(path: Path | str) -> Lens:
-    """Read a lens from OpenCV FileStorage (YAML, XML or JSON).
+    """Read a lens from OpenCV FileStorage (YAML, XML or JSON), or from YAML as ROS writes it.
 
     Raises:
         InputError: the file is missing, is no FileStorage, or a node is missing, malformed or out of range.
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = decoded(path.read_bytes())
     except FileNotFoundError:
         raise InputError(f"{path}: not found; calibrate with `rooftrack lens` or correct the path.") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give an OpenCV FileStorage file.") from None
+    except ValueError as error:
         raise InputError(f"{path}: cannot be read as text ({error}); give an OpenCV FileStorage file.") from None
     nodes = _LensNodes(path, text)
     width, height = nodes.whole_number("image_width"), nodes.whole_number("image_height")
@@ -253,7 +262,7 @@ def read_lens(path: Path | str) -> Lens:
         image_size_px=(width, height),
         camera_matrix=nodes.camera_matrix(width, height),
         distortion=nodes.distortion(),
-        readout_s=nodes.number("readout_s", default=0.0, above=None),
+        readout_s=nodes.readout_s(),
         rms_px=nodes.optional_number("rms_px"),
         sigma=LensSigma(
             focal_relative=nodes.number("sigma_focal_relative", default=defaults.focal_relative),
@@ -288,10 +297,13 @@ class _LensNodes:
         self._path = path
         try:
             self._storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+            is_usable = self._storage.isOpened() and self._storage.root().isMap()
         except (cv2.error, SystemError):
+            is_usable = False
+        if not is_usable:
             raise InputError(
                 f"{path}: is not an OpenCV FileStorage file; write one with `rooftrack lens` or cv2.FileStorage."
-            ) from None
+            )
 
     def _refuse(self, name: str, problem: str) -> InputError:
         return InputError(f"{self._path}: {name} {problem}.")
@@ -305,10 +317,7 @@ class _LensNodes:
         if node is None:
             raise self._refuse(name, "is missing; add it, or calibrate anew with `rooftrack lens`")
         try:
-            if node.isSeq():
-                values = np.array([node.at(i).real() for i in range(node.size())], dtype=np.float64)
-            else:
-                values = np.asarray(node.mat(), dtype=np.float64)
+            values = _numbers(node)
         except (cv2.error, SystemError, TypeError, ValueError):
             raise self._refuse(name, "is not a matrix of numbers; write it as !!opencv-matrix") from None
         if not np.isfinite(values).all():
@@ -322,6 +331,11 @@ class _LensNodes:
         K = K.reshape(3, 3)
         if not (K[0, 0] > 0 and K[1, 1] > 0 and np.array_equal(K[2], [0, 0, 1]) and K[1, 0] == 0):
             raise self._refuse("camera_matrix", "must be [fx 0 cx; 0 fy cy; 0 0 1] with positive fx and fy")
+        if min(K[0, 0], K[1, 1]) < _SHORTEST_FOCAL * max(width, height):
+            raise self._refuse(
+                "camera_matrix",
+                f"has focal lengths of {K[0, 0]:g} and {K[1, 1]:g}; write them in pixels, not in millimetres",
+            )
         if K[0, 1] != 0:
             raise self._refuse("camera_matrix", "has a skew, which the model does not know; calibrate without it")
         if not (-width < K[0, 2] < 2 * width and -height < K[1, 2] < 2 * height):
@@ -331,7 +345,12 @@ class _LensNodes:
         return K
 
     def distortion(self) -> Floats:
+        model = self._node("distortion_model")
+        if model is not None and model.string() not in _MODELS:
+            raise self._refuse("distortion_model", f"is {model.string()}; calibrate with k1 k2 p1 p2 k3 only")
         values = self._array("distortion_coefficients").ravel()
+        if not values[5:].any():
+            values = values[:5]
         if len(values) >= 8:
             raise self._refuse(
                 "distortion_coefficients",
@@ -362,13 +381,39 @@ class _LensNodes:
             raise self._refuse(name, "is not finite; write a number")
         return value
 
-    def number(self, name: str, *, default: float, above: float | None = 0.0) -> float:
+    def number(self, name: str, *, default: float) -> float:
         value = self.optional_number(name)
         if value is None:
             return default
-        if above is not None and not value > above:
-            raise self._refuse(name, f"is {value:g}; it must be more than {above:g}")
+        if not value > 0:
+            raise self._refuse(name, f"is {value:g}; it must be more than 0")
         return value
+
+    def readout_s(self) -> float:
+        value = self.optional_number("readout_s") or 0.0
+        if abs(value) >= _LONGEST_READOUT_S:
+            raise self._refuse(
+                "readout_s",
+                f"is {value:g}, but no camera takes {_LONGEST_READOUT_S:g} s from its first row to its last; write "
+                "seconds, such as 0.02, or 0",
+            )
+        return value
+
+
+def _numbers(node: Any) -> Floats:
+    """Return the numbers of a matrix, a list, lists in a list or, as ROS writes them, `data` beside rows and columns.
+
+    Raises:
+        TypeError, ValueError, cv2.error, SystemError: it is none of these.
+    """
+    if node.isSeq():
+        return np.array([value for place in range(node.size()) for value in _numbers(node.at(place)).ravel()])
+    if node.isInt() or node.isReal():
+        return np.array([node.real()])
+    if node.isMap() and node.getNode("dt").empty() and node.getNode("data").isSeq():
+        return _numbers(node.getNode("data"))
+    matrix = node.mat()
+    return np.empty(0) if matrix is None else np.asarray(matrix, dtype=np.float64)
 
 
 def _shape(array: Floats) -> str:

@@ -105,6 +105,10 @@ class MeasurementStore:
             self._db = sqlite3.connect(file, timeout=20.0)
             self._db.execute("PRAGMA foreign_keys = ON")
             self._db.executescript(_SCHEMA)
+        except sqlite3.OperationalError as error:
+            raise InputError(
+                f"{file}: cannot be opened ({error}); make room for it, or move away what is in its place."
+            ) from None
         except sqlite3.DatabaseError as error:
             raise InputError(f"{file}: is not readable ({error}); delete it, it can be measured again.") from None
         self._last_commit = time.monotonic()

@@ -5,7 +5,9 @@ Whatever a file calls its columns, they arrive here as one table of named column
 
 from __future__ import annotations
 
+import codecs
 import itertools
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +40,7 @@ _PLY_TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
+_WITH_COMMAS = re.compile(rb"[-+]?\d+(?P<decimals>,\d+)?(?P<after>,?)")
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ def read_ply(path: Path, progress: Progress) -> PointTable:
             order = "<" if encoding == "binary_little_endian" else ">"
             for _, lines, earlier in before:
                 stream.seek(lines * sum(np.dtype(kind).itemsize for _, kind in earlier), 1)
-            dtype = np.dtype([(name, order + kind) for name, kind in properties])
+            dtype = _record_type(path, [(name, order + kind) for name, kind in properties])
             table = _records(path, stream, dtype, count)
     progress("cloud", 1, 1)
     float32 = encoding != "ascii" and dict(properties).get("x") == "f4"
@@ -105,7 +108,7 @@ def _ply_header(path: Path, stream: IO[bytes]) -> tuple[str, list[tuple[str, int
                 case ["format", encoding, *_]:
                     pass
                 case ["element", name, count]:
-                    elements.append((name, int(count), []))
+                    elements.append((name, _count(count), []))
                 case ["property", "list", *_, name]:
                     elements[-1][2].append((name, "list"))
                 case ["property", kind, name]:
@@ -113,6 +116,18 @@ def _ply_header(path: Path, stream: IO[bytes]) -> tuple[str, list[tuple[str, int
         except (ValueError, KeyError, IndexError):
             raise InputError(f"{path}: header line `{' '.join(words)}` is not PLY; export the file again.") from None
     raise InputError(f"{path}: its PLY header does not end or names no known format; export the file again.")
+
+
+def _count(word: str) -> int:
+    """Return how many there are of something.
+
+    Raises:
+        ValueError: it is no number, or a negative one.
+    """
+    count = int(word)
+    if count < 0:
+        raise ValueError(f"{count} of something")
+    return count
 
 
 def _header_lines(path: Path) -> int:
@@ -129,11 +144,12 @@ def read_pcd(path: Path, progress: Progress) -> PointTable | None:
     with path.open("rb") as stream:
         header, lines = _pcd_header(path, stream)
         try:
-            sizes, counts = [int(word) for word in header["SIZE"]], [int(word) for word in header["COUNT"]]
-            types = [kind.lower() + str(size) for kind, size in zip(header["TYPE"], sizes, strict=True)]
+            counts = [_count(word) for word in header["COUNT"]]
+            kinds = zip(header["TYPE"], header["SIZE"], strict=True)
+            types = [np.dtype(f"<{kind.lower()}{size}").str for kind, size in kinds]
             fields = list(zip(header["FIELDS"], types, counts, strict=True))
-            count, encoding = int(header["POINTS"][0]), header["DATA"][0]
-        except (KeyError, ValueError, IndexError):
+            count, encoding = _count(header["POINTS"][0]), header["DATA"][0]
+        except (KeyError, ValueError, IndexError, TypeError):
             raise InputError(f"{path}: its PCD header is incomplete or inconsistent; export the file again.") from None
         names = [name if width == 1 else f"{name}*{width}" for name, _, width in fields]
         if encoding == "ascii":
@@ -141,15 +157,18 @@ def read_pcd(path: Path, progress: Progress) -> PointTable | None:
             values = _text_rows(path, stream, lines, columns=sum(counts), rows=count)
             _require_count(path, len(values), count)
             table: Any = {name: values[:, first] for name, first in zip(names, firsts, strict=True)}
-        elif encoding == "binary":
+        elif encoding in ("binary", "binary_compressed"):
             unique = [f"_{i}" if name == "_" else name for i, name in enumerate(names)]
-            dtype = np.dtype([(n, "<" + kind, (w,)) if w > 1 else (n, "<" + kind)
-                              for n, (_, kind, w) in zip(unique, fields, strict=True)])  # fmt: skip
+            dtype = _record_type(path, [(n, kind, (w,)) if w > 1 else (n, kind)
+                                        for n, (_, kind, w) in zip(unique, fields, strict=True)])  # fmt: skip
+            if encoding == "binary_compressed":
+                _require_whole_compressed(path, stream, count * dtype.itemsize)
+                return None
             table = _records(path, stream, dtype, count)
         else:
-            return None
+            raise InputError(f'{path}: its PCD header says "DATA {encoding}", which is no PCD; export the file again.')
     progress("cloud", 1, 1)
-    float32 = encoding == "binary" and dict(zip(names, types, strict=True)).get("x") == "f4"
+    float32 = encoding == "binary" and dict(zip(names, types, strict=True)).get("x") == "<f4"
     packed = {name: table[name] for name in ("rgb", "rgba") if name in names}
     result = _table(path, names, table, float32)
     for value, kind in ((value, types[names.index(name)]) for name, value in packed.items()):
@@ -171,7 +190,7 @@ def _pcd_header(path: Path, stream: IO[bytes]) -> tuple[dict[str, list[str]], in
 
 def _unpacked_rgb(packed: NDArray[Any], kind: str) -> NDArray[np.uint8]:
     """Split PCL's colour, four bytes that are declared a float or an integer, into (N, 3)."""
-    whole = packed.astype(np.float32).view(np.uint32) if kind.startswith("f") else packed.astype(np.uint32)
+    whole = packed.astype(np.float32).view(np.uint32) if kind.startswith("<f") else packed.astype(np.uint32)
     return np.stack([(whole >> shift) & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
 
 
@@ -179,7 +198,7 @@ def read_text(path: Path, progress: Progress) -> PointTable:
     """Read columns of numbers: XYZ, PTS, TXT or CSV, with or without a line of names.
 
     Without names the columns are x y z, then intensity (4 columns), red green blue (6), or intensity red green
-    blue (7, as PTS has them).
+    blue (7, as PTS has them). Numbers may have decimal commas where commas separate no columns.
 
     Raises:
         InputError: a line is not what the first one promises; the line is named.
@@ -191,7 +210,9 @@ def read_text(path: Path, progress: Progress) -> PointTable:
             stream.readline()
         lines_before = layout.skip
         while True:
-            part = _text_rows(path, stream, lines_before, columns=len(layout.names), rows=_TEXT_CHUNK_ROWS)
+            part = _text_rows(
+                path, stream, lines_before, columns=len(layout.names), rows=_TEXT_CHUNK_ROWS, comma=layout.comma
+            )
             if not len(part):
                 break
             parts.append(part)
@@ -208,32 +229,34 @@ def read_text(path: Path, progress: Progress) -> PointTable:
 
 @dataclass(frozen=True)
 class _TextLayout:
+    """What to skip, the columns' names, how many points a PTS file promises, and what a comma stands for."""
+
     skip: int
     names: list[str]
     count: int | None
+    comma: str
 
 
 def _text_layout(path: Path) -> _TextLayout:
-    """Look at the first lines: what to skip, what the columns are, how many points a PTS file promises."""
+    """Look at the first lines."""
     names, count = list[str](), None
     with path.open("rb") as stream:
         for number, line in enumerate(stream):
-            words = _words(line)
+            if number == 0 and line.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+                raise InputError(f"{path}: is text in UTF-16; save it as UTF-8.")
+            comma = _meaning_of_comma(path, number + 1, line)
+            words = _words(line, comma)
             if number > 100:
                 break
             if not words or (line.lstrip().startswith((b"#", b"//")) and not _as_names(words)):
                 continue
             if _as_names(words):
-                names = [_COLUMN_OF_NAME.get(word.lower().lstrip("#/"), word.lower()) for word in words if word != "#"]
+                bare = [word.lower().lstrip("#/") for word in words]
+                names = [_COLUMN_OF_NAME.get(name, name) for name in bare if name]
             elif len(words) == 1 and words[0].isdigit():
                 count = int(words[0])
-            elif _has_decimal_commas(line):
-                raise InputError(
-                    f"{path}: line {number + 1} has decimal commas, which cannot be told from commas between columns; "
-                    "export the points with decimal points."
-                )
             elif len(words) >= 3 and _all_numbers(words):
-                return _TextLayout(number, names or _names_by_number(path, stream, words), count)
+                return _TextLayout(number, names or _names_by_number(path, stream, words, comma), count, comma)
             else:
                 raise InputError(
                     f"{path}: line {number + 1} is neither names of columns with x, y and z nor three or more numbers; "
@@ -242,14 +265,25 @@ def _text_layout(path: Path) -> _TextLayout:
     raise InputError(f"{path}: holds no points; export it again.")
 
 
-def _words(line: bytes) -> list[str]:
-    return [word.strip('"') for word in re.split(r"[\s,;]+", _spaced(line)) if word]
+def _words(line: bytes, comma: str = " ") -> list[str]:
+    return [word.strip('"') for word in _spaced(line, comma).split()]
 
 
-def _has_decimal_commas(line: bytes) -> bool:
-    """Whether a line such as `12,34;5,60;0,01` has other things than commas between its columns."""
-    words = re.split(rb"[\s;]+", line.strip())
-    return len(words) >= 3 and b"." not in line and any(re.fullmatch(rb"[-+]?\d+,\d+", word) for word in words)
+def _meaning_of_comma(path: Path, number: int, line: bytes) -> str:
+    """Return what takes the place of commas: a point where they are decimal, as in `12,34;5;0,01`, else a blank.
+
+    Raises:
+        InputError: they are both, as in `12,34, 5, 0,01`.
+    """
+    words = [_WITH_COMMAS.fullmatch(word) for word in re.split(rb"[\s;]+", line.strip().rstrip(b";"))]
+    if len(words) < 3 or not any(word and word["decimals"] for word in words) or not all(words):
+        return " "
+    if any(word and word["after"] for word in words):
+        raise InputError(
+            f"{path}: line {number} has decimal commas, which cannot be told from commas between columns; "
+            "export the points with decimal points."
+        )
+    return "."
 
 
 def _as_names(words: list[str]) -> bool:
@@ -265,7 +299,7 @@ def _all_numbers(words: list[str]) -> bool:
     return True
 
 
-def _names_by_number(path: Path, stream: IO[bytes], first: list[str]) -> list[str]:
+def _names_by_number(path: Path, stream: IO[bytes], first: list[str], comma: str) -> list[str]:
     by_count = {
         3: [],
         4: ["intensity"],
@@ -275,7 +309,7 @@ def _names_by_number(path: Path, stream: IO[bytes], first: list[str]) -> list[st
     if len(first) not in by_count:
         raise InputError(f"{path}: has {len(first)} columns without names; add a first line that names x, y and z.")
     names = ["x", "y", "z", *by_count[len(first)]]
-    sample = [first, *(_words(line) for line, _ in zip(stream, range(200), strict=False))]
+    sample = [first, *(_words(line, comma) for line, _ in zip(stream, range(200), strict=False))]
     colours = [[float(word) for word in row[-3:]] for row in sample if len(row) == len(first) and _all_numbers(row)]
     if "red" in names and any(value < 0 or value != int(value) for row in colours for value in row):
         # Three more columns with signs or fractions are normals, not colours.
@@ -283,9 +317,11 @@ def _names_by_number(path: Path, stream: IO[bytes], first: list[str]) -> list[st
     return names
 
 
-def _text_rows(path: Path, stream: IO[bytes], lines_before: int, *, columns: int, rows: int) -> Floats:
+def _text_rows(
+    path: Path, stream: IO[bytes], lines_before: int, *, columns: int, rows: int, comma: str = " "
+) -> Floats:
     """Read up to `rows` lines of `columns` numbers, however they are separated."""
-    lines = [_spaced(line) for line in itertools.islice(stream, rows)]
+    lines = [_spaced(line, comma) for line in itertools.islice(stream, rows)]
     if not any(line.strip() and not line.startswith(("#", "//")) for line in lines):
         return np.empty((0, columns))
     try:
@@ -303,14 +339,38 @@ def _holds(line: str, columns: int) -> bool:
     return not words or line.startswith(("#", "//")) or (len(words) == columns and _all_numbers(words))
 
 
-def _spaced(line: bytes) -> str:
-    return line.decode("latin-1").removeprefix(_BYTE_ORDER_MARK).replace(",", " ").replace(";", " ").lstrip()
+def _spaced(line: bytes, comma: str) -> str:
+    """Return a line with blanks between its columns, and something else in place of commas."""
+    return line.decode("latin-1").removeprefix(_BYTE_ORDER_MARK).replace(",", comma).replace(";", " ").lstrip()
+
+
+def _record_type(path: Path, columns: list[Any]) -> np.dtype[Any]:
+    """Return the type of a binary file's records from the name, type and perhaps width of each column."""
+    try:
+        return np.dtype(columns)
+    except ValueError as error:
+        raise InputError(f"{path}: its header is inconsistent ({error}); export the file again.") from None
 
 
 def _records(path: Path, stream: IO[bytes], dtype: np.dtype[Any], count: int) -> NDArray[Any]:
-    content = stream.read(count * dtype.itemsize)
-    _require_count(path, len(content) // dtype.itemsize, count)
-    return np.frombuffer(content, dtype=dtype, count=count)
+    _require_count(path, _bytes_left(stream) // max(dtype.itemsize, 1), count)
+    return np.frombuffer(stream.read(count * dtype.itemsize), dtype=dtype, count=count)
+
+
+def _require_whole_compressed(path: Path, stream: IO[bytes], size: int) -> None:
+    """Refuse compressed points that are cut off, or are not `size` bytes of them as the header says."""
+    sizes = stream.read(8)
+    compressed, expanded = np.frombuffer(sizes.ljust(8, b"\0"), dtype="<u4").tolist()
+    if len(sizes) < 8 or compressed > _bytes_left(stream):
+        raise InputError(f"{path}: ends before its compressed points do; copy it again, it is cut off.")
+    if expanded != size:
+        raise InputError(
+            f"{path}: holds {expanded} bytes of points and not {size} as its header says; export it again."
+        )
+
+
+def _bytes_left(stream: IO[bytes]) -> int:
+    return os.fstat(stream.fileno()).st_size - stream.tell()
 
 
 def _require_count(path: Path, found: int, promised: int) -> None:

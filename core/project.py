@@ -18,6 +18,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from core.errors import InputError
 from core.storage import write_atomically
+from core.text_files import decoded
 
 PROJECT_FILE = "project.json"
 RESULTS_FOLDER = "results"
@@ -239,11 +240,13 @@ def read_project(folder: Path) -> Project:
     """
     file = folder / PROJECT_FILE
     try:
-        text = file.read_text(encoding="utf-8")
+        text = decoded(file.read_bytes())
     except FileNotFoundError:
         raise InputError(f"{file}: not found; make a project with `rooftrack new {folder} --video FILE`.") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: cannot be read ({error}); restore it from a copy.") from None
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); restore it from a copy.") from None
+    except ValueError as error:
+        raise InputError(f"{file}: cannot be read as text ({error}); restore it from a copy.") from None
     return parse_project(text, file)
 
 

@@ -20,6 +20,7 @@ from core.coordinates import Floats
 from core.errors import InputError
 from core.export import Results, write_results
 from core.georeference import ReferenceFit
+from core.gps_record import GpsRecord, read_gps
 from core.ground_plane import GroundPlane, fit_ground_plane
 from core.ground_poses import fit_with_relief
 from core.lens import Lens, read_lens, require_image_size
@@ -33,7 +34,6 @@ from core.project import PROJECT_FILE, RESULTS_FOLDER, Project, naming_file, rea
 from core.relief import Relief, rasterise
 from core.solve import solve
 from core.storage import File, content_identity, file_at, opened, state_of, write_atomically
-from core.validation import GpsRecord, read_gps
 from core.version import program_version
 from core.video import VideoInfo, frame_index, probe
 
@@ -132,6 +132,7 @@ def run_project(
             solution=solution,
             gps=inputs.gps,
             video=inputs.video,
+            announced_s=inputs.info.duration_s,
             sha256={name: sha256_of(file, folder / RESULTS_FOLDER) for name, file in files.items()},
             identity={name: content_identity(file) for name, file in files.items()},
             version=program_version(),
@@ -250,8 +251,10 @@ def relief_plan(folder: Path, project: Project) -> ReliefPlan | None:
 def _cloud_identity(cloud_file: Path) -> str:
     try:
         return content_identity(cloud_file)
-    except OSError:
+    except FileNotFoundError:
         raise InputError(f"{cloud_file}: not found; correct inputs.cloud or put the file there.") from None
+    except OSError as error:
+        raise InputError(f"{cloud_file}: cannot be read ({error.strerror}); correct inputs.cloud.") from None
 
 
 def _relief_of(folder: Path, project: Project, progress: Progress) -> Relief | None:

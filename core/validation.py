@@ -7,11 +7,8 @@ Source: the paper's "Validation of Motion-Tracking Results", Fig. 11 and Table 2
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,11 +17,11 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 
-from core.clock_times import EXAMPLES, ClockTime, finite, read_time, seconds
 from core.coordinates import Bools, Floats, read_only
 from core.errors import InputError
+from core.gps_record import GpsRecord
 from core.intervals import within
-from core.project import GpsInput, Intervals
+from core.project import Intervals
 
 # Velocities of the same motion correlate above 0.9; of two records of noise, below 0.3 at every lag tried.
 _LEAST_CORRELATION = 0.5
@@ -38,29 +35,20 @@ _MOST_CANDIDATES = 12
 _RIVAL = 1.2
 # A GPS time is compared where the video was measured on both sides, not farther apart than this many frames.
 _BRIDGED_FRAMES = 3.5
-# Samples a record may lack: about six days at 10 Hz. Laid out evenly they take a gigabyte when they are correlated.
-_MOST_MISSING = 5_000_000
 # Lags tried between two GPS samples, unless frames lie farther apart.
 _TRIALS_PER_SAMPLE = 5
 # The time in which a change stands well out of the noise of two samples, and the shaking does not yet turn round.
 _LEAST_CHANGE_S = 0.1
+# What people write coordinates in by mistake, how many times as large as metres, and how far from that a record of the
+# same motion may be: degrees of longitude grow shorter towards the poles.
+_OTHER_UNITS = (
+    ("millimetres", 1000.0, 1.25),
+    ("centimetres", 100.0, 1.25),
+    ("feet", 1 / 0.3048, 1.25),
+    ("degrees", 1 / 111_000, 5.0),
+)
 # GPS samples farther apart than this many frames straddle peaks that the video sees.
 _COARSE_FRAMES = 1.5
-
-
-@dataclass(frozen=True)
-class GpsRecord:
-    """Positions of an antenna on the target.
-
-    Attributes:
-        name: of the file, for messages.
-        time_s: (G,) increasing, the receiver's own clock.
-        position_m: (G, 2) east and north, any origin.
-    """
-
-    name: str
-    time_s: Floats
-    position_m: Floats
 
 
 @dataclass(frozen=True)
@@ -186,134 +174,6 @@ class GpsComparison:
         }
 
 
-def read_gps(path: Path, settings: GpsInput) -> GpsRecord:
-    """Read a GPS record: text with a header line and one position a line.
-
-    Columns are separated by commas, semicolons or tabs; other columns, empty lines and lines that start with # are
-    passed over. Times are seconds, or dates and times of day, which count from the first.
-
-    Raises:
-        InputError: names the file, and the missing column or the line at fault.
-    """
-    lines = _content_lines(path)
-    separator, header = _header_of(lines[0][1])
-    columns = {key: getattr(settings, key) for key in ("time", "x", "y")}
-    for key, name in columns.items():
-        if name not in header:
-            found = ", ".join(f'"{column}"' for column in header)
-            raise InputError(
-                f'{path}: has no column "{name}" (found {found}); name the right one in inputs.gps.{key} of '
-                "project.json."
-            )
-    places = [header.index(name) for name in columns.values()]
-    rows = [_row(path, line, text, separator=separator, places=places, header=header) for line, text in lines[1:]]
-    if len(rows) < 4:
-        raise InputError(f"{path}: has {len(rows)} positions; at least four are needed for a comparison.")
-    moments, positions = zip(*rows, strict=True)
-    _require_one_notation(path, columns["time"], moments, lines)
-    time_s = seconds(moments)
-    backwards = np.flatnonzero(np.diff(time_s) <= 0)
-    if len(backwards):
-        line = lines[backwards[0] + 2][0]
-        raise InputError(
-            f'{path}: line {line}: "{columns["time"]}" is {time_s[backwards[0] + 1]:g}, not after the line before '
-            f"({time_s[backwards[0]]:g}); sort the record and remove what is double."
-        )
-    _require_one_stretch(path, time_s, lines)
-    return GpsRecord(path.name, read_only(time_s), read_only(positions))
-
-
-def _require_one_notation(path: Path, name: str, moments: Sequence[ClockTime], lines: list[tuple[int, str]]) -> None:
-    """Refuse times of which some are written in another way than the first.
-
-    Args:
-        lines: of the file, the header first.
-    """
-    first = moments[0].notation
-    for moment, (line, _) in zip(moments, lines[1:], strict=True):
-        if moment.notation is not first:
-            raise InputError(
-                f'{path}: line {line}: "{name}" is {moment.notation}, but {first} in the lines before; write all alike.'
-            )
-
-
-def _require_one_stretch(path: Path, time_s: Floats, lines: list[tuple[int, str]]) -> None:
-    """Refuse times that jump so far that no even grid over them fits into memory, as from 0 to Unix seconds.
-
-    Args:
-        lines: of the file, the header first.
-    """
-    steps_s = np.diff(time_s)
-    usual_s = float(np.median(steps_s))
-    if (time_s[-1] - time_s[0]) / usual_s - len(steps_s) <= _MOST_MISSING:
-        return
-    widest = int(np.argmax(steps_s))
-    raise InputError(
-        f"{path}: line {lines[widest + 2][0]}: its time is {steps_s[widest]:g} s after that of the line before, "
-        f"{time_s[widest]:g} s, while most are {usual_s:g} s apart; correct the times, or keep only the stretch of "
-        "this video."
-    )
-
-
-def gps_columns(path: Path) -> list[str]:
-    """Return the names of a GPS record's columns, to choose time and place from.
-
-    Raises:
-        InputError: the file cannot be read as text, or is empty.
-    """
-    return _header_of(_content_lines(path)[0][1])[1]
-
-
-def _header_of(line: str) -> tuple[str, list[str]]:
-    """Return what separates the columns, and their names."""
-    separator = max(",;\t", key=line.count)
-    return separator, [name.strip() for name in next(csv.reader([line], delimiter=separator))]
-
-
-def _content_lines(path: Path) -> list[tuple[int, str]]:
-    """Return (line number, text) of the lines that carry something."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(
-            f"{path}: not found; correct inputs.gps.file of project.json or set inputs.gps to null."
-        ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error}); export the GPS record as CSV.") from None
-    lines = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not lines:
-        raise InputError(f"{path}: is empty; export the GPS record again as CSV with a header line.")
-    return lines
-
-
-def _row(
-    path: Path, line: int, text: str, *, separator: str, places: list[int], header: list[str]
-) -> tuple[ClockTime, tuple[float, float]]:
-    """Return the time and the position in a line."""
-    fields = next(csv.reader([text], delimiter=separator))
-    time_text, x_text, y_text = (fields[place].strip() if place < len(fields) else "" for place in places)
-
-    def refusal(place: int, field: str, wanted: str) -> InputError:
-        what = f'"{field}", not {wanted}' if field else "empty"
-        return InputError(f'{path}: line {line}: "{header[place]}" is {what}; correct or remove the line.')
-
-    try:
-        moment = read_time(time_text)
-    except ValueError:
-        raise refusal(places[0], time_text, f"a number or a time such as {EXAMPLES}") from None
-    position = []
-    for place, field in zip(places[1:], (x_text, y_text), strict=True):
-        try:
-            position.append(finite(field))
-        except ValueError:
-            raise refusal(place, field, "a number") from None
-    return moment, (position[0], position[1])
-
-
 def compare_with_gps(
     time_s: ArrayLike,
     displacement_m: ArrayLike,
@@ -337,7 +197,7 @@ def compare_with_gps(
         max_lag_s: largest difference of the clocks to consider; any where None.
 
     Raises:
-        InputError: the video has no measured frames, or the two records share no time.
+        InputError: the video has no measured frames, the two records share no time, or GPS is not in metres.
     """
     times = np.asarray(time_s, dtype=np.float64)
     moved = np.asarray(displacement_m, dtype=np.float64)
@@ -443,6 +303,7 @@ def _lag(video: _Video, gps: GpsRecord, max_lag_s: float | None) -> _Lag:
     best = float(correlations.max(initial=-1.0))
     if best < _LEAST_CORRELATION:
         return _Lag(0.0, None, best)
+    _require_metres(video, gps, float(lags_s[np.argmax(correlations)]))
     # Regular shaking correlates nearly as well a period earlier or later: every good peak is refined, the best kept.
     higher = (correlations >= _CANDIDATE * best) & _local_maxima(correlations)
     coarse = np.flatnonzero(higher)[np.argsort(correlations[higher])[::-1][:_MOST_CANDIDATES]]
@@ -492,6 +353,28 @@ def _correlations(video: _Video, gps: GpsRecord) -> tuple[Floats, Floats]:
     return shifts * step_s + video.times[0] - gps.time_s[0], correlations
 
 
+def _require_metres(video: _Video, gps: GpsRecord, lag_s: float) -> None:
+    """Refuse a record that moves with the video, but so much more or less that it must be in another unit.
+
+    Raises:
+        InputError: it does.
+    """
+    seen, recorded = (
+        _moved_in(times, moved, times_of_gps, _LEAST_CHANGE_S)
+        for times, moved, times_of_gps in (
+            (video.times, video.moved, gps.time_s + lag_s),
+            (gps.time_s, gps.position_m, gps.time_s),
+        )
+    )
+    times_as_much = float(np.sum(seen * recorded) / np.sum(seen**2))
+    for unit, in_a_metre, spread in _OTHER_UNITS:
+        if in_a_metre / spread < times_as_much < in_a_metre * spread:
+            raise InputError(
+                f"{gps.name}: its positions move {times_as_much:.4g} times as much as the video, as if they were in "
+                f"{unit}; convert them to metres, or set inputs.gps to null."
+            )
+
+
 def _summed(video: Floats, gps: Floats) -> Floats:
     """Return (L,) the sum of products of columns (M, K) and (G, K) at every shift of the second against the first."""
     columns = [correlate(*pair, method="fft") for pair in zip(video.T, gps.T, strict=True)]
@@ -519,7 +402,9 @@ def _refined(
     Displacements tell the lag best where their difference is noise. Where it is camera drift, the change from one GPS
     sample to the next (`differenced`) tells it better, since drift is slow. The smaller standard deviation decides.
     """
-    coarse_times = gps.time_s + coarse_s
+    margin_s = 3 * step_s
+    beside = within(gps.time_s + coarse_s, (float(video.times[0]) - margin_s, float(video.times[-1]) + margin_s))
+    coarse_times, position_m = gps.time_s[beside] + coarse_s, gps.position_m[beside]
 
     def compared(values: Floats) -> Floats:
         change = np.diff(values, axis=0) if differenced else values
@@ -527,7 +412,7 @@ def _refined(
 
     # Measured from the coarse lag: clocks may differ by weeks, and the minimiser's tolerance grows with the number.
     def rms(correction_s: float) -> float:
-        difference = compared(video.at(coarse_times + correction_s) - gps.position_m)
+        difference = compared(video.at(coarse_times + correction_s) - position_m)
         return float(np.sqrt(np.mean((difference - difference.mean(axis=0)) ** 2))) if len(difference) > 3 else math.inf
 
     trials_s = np.linspace(-1.5 * step_s, 1.5 * step_s, 13)

@@ -123,9 +123,16 @@ def opened_video(path: File) -> Iterator[tuple[InputContainer, VideoStream]]:
         # FFmpeg opens what lies on this machine itself.
         source = str(path) if isinstance(path, Path) else stack.enter_context(opened(path))
         container = stack.enter_context(_container(path, source))
+        if _is_picture(container):
+            raise InputError(f"{path}: is a picture and no video; choose the file with the film.")
         if not container.streams.video:
             raise InputError(f"{path}: holds no video stream; choose the file with the pictures.")
         yield container, max(container.streams.video, key=_is_film_and_size)
+
+
+def _is_picture(container: InputContainer) -> bool:
+    """Whether FFmpeg reads it by what it calls a pipe of pictures, of which this one is the first and last."""
+    return container.format.name.endswith("_pipe") or container.format.name == "image2"
 
 
 def _is_film_and_size(stream: VideoStream) -> tuple[bool, int]:
@@ -139,7 +146,10 @@ def _container(path: File, source: str | BinaryIO) -> InputContainer:
     except FileNotFoundError:
         raise InputError(f"{path}: not found; correct inputs.video or put the file there.") from None
     except (av.error.FFmpegError, OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be opened as a video ({_reason(error)}); export it again as MP4.") from None
+        raise InputError(
+            f"{path}: cannot be opened as a video ({_reason(error)}); copy it again if it was cut off, or "
+            "export it as MP4."
+        ) from None
 
 
 def _reason(error: Exception) -> str:
@@ -166,7 +176,7 @@ def probe(path: File) -> VideoInfo:
             frames=stream.frames or None,
             duration_s=duration_s,
             rate_hz=rate_hz,
-            codec=stream.codec_context.name,
+            codec=stream.codec_context.codec.canonical_name,
             rotation_deg=-frame.rotation % 360,
         )
 

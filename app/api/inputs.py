@@ -32,10 +32,10 @@ from app.store import (
 from app.uploads import receive_file
 from app.videos import is_read_through, video_info
 from core.errors import InputError
+from core.gps_record import gps_columns, read_gps
 from core.lens import read_lens, require_image_size
 from core.project import Project
 from core.storage import File
-from core.validation import gps_columns, read_gps
 from core.video import frame_index
 
 router = APIRouter(prefix="/api")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import signal
 import subprocess
 import sys
@@ -157,13 +159,23 @@ def test_an_unexpected_error_is_kept_in_a_file(
     assert "Traceback" in account.read_text(encoding="utf-8")
 
 
-def test_a_full_disk_is_told(tmp_path: Path, engine: Any, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("code", "told"),
+    [
+        (errno.ENOSPC, "frames.sqlite: No space left on device; make room on the disk"),
+        (errno.EISDIR, "frames.sqlite: Is a directory; move away what lies in its place"),
+        (errno.EACCES, "frames.sqlite: Permission denied; make it accessible"),
+    ],
+)
+def test_a_disk_that_refuses_is_told(
+    tmp_path: Path, engine: Any, capsys: pytest.CaptureFixture[str], code: int, told: str
+) -> None:
     def run(folder: Path, **rest: Any) -> None:
-        raise OSError(28, "No space left on device", "frames.sqlite")
+        raise OSError(code, os.strerror(code), "frames.sqlite")
 
     engine(run)
     assert main(["run", str(project_at(tmp_path / "eq7"))]) == 1
-    assert "frames.sqlite: No space left on device" in one_sentence(capsys.readouterr().err)
+    assert told in one_sentence(capsys.readouterr().err)
 
 
 @pytest.mark.parametrize(

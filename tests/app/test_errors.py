@@ -110,7 +110,12 @@ def test_what_the_engine_raises_becomes_an_answer(raised: Exception, status: int
 
 
 @pytest.mark.parametrize(
-    ("code", "words"), [(errno.ENOSPC, "The disk is full"), (errno.EACCES, "does not allow writing to project.json")]
+    ("code", "words"),
+    [
+        (errno.ENOSPC, "The disk is full"),
+        (errno.EACCES, "does not allow writing to project.json"),
+        (errno.EISDIR, "project.json: no; move away what lies in its place"),
+    ],
 )
 def test_a_disk_that_refuses_is_told_in_a_sentence_and_the_edit_is_not_lost(
     client: TestClient, workspace: Path, monkeypatch: pytest.MonkeyPatch, code: int, words: str

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import errno
+import io
+import json
 import subprocess
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
-from app import jobs
+from app import jobs, worker
 from app.context import Context
 
 SMALL = "/api/projects/small"
@@ -97,3 +101,17 @@ def test_a_killed_reading_of_the_cloud_is_told_and_begins_anew_when_asked_to(
     assert len(workers) == 1
     assert cloud(again=1)["reading"]
     wait_until(lambda: "points" in cloud())
+
+
+def test_a_disk_that_refuses_a_job_is_told_as_the_disks_fault(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def work(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "eq7/results")
+
+    reports = io.StringIO()
+    order = {"kind": "track", "folder": str(tmp_path), "parameters": {}}
+    monkeypatch.setattr("app.work.WORK", {"track": work})
+    monkeypatch.setattr("app.worker._own_stdout", lambda: reports)
+    monkeypatch.setattr("sys.stdin", io.StringIO(json.dumps(order) + "\n"))
+    assert worker.main() == 0
+    told = json.loads(reports.getvalue().splitlines()[-1])
+    assert told == {"failed": "eq7/results: No space left on device; make room on the disk, then do it again."}

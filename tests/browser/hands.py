@@ -72,3 +72,33 @@ def centre_of(mark: Locator) -> Floats:
     """Return where the middle of an SVG mark is in the window, CSS px, from its own transform."""
     where = mark.evaluate("g => { const m = g.getScreenCTM(); return [m.e, m.f]; }")
     return np.array(where)
+
+
+def finger(page: Page, start: Floats, shift: tuple[float, float]) -> None:
+    """Put one finger somewhere in the window, drag it, let go."""
+    touch = page.context.new_cdp_session(page)
+    for kind, part in (("touchStart", 0.0), *(("touchMove", part / 10) for part in range(1, 11))):
+        x, y = np.asarray(start) + part * np.array(shift)
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": float(x), "y": float(y)}]})
+    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    touch.detach()
+
+
+def pinch(page: Page, pane: Locator, spread_px: tuple[float, float], shift: tuple[float, float] = (0.0, 0.0)) -> None:
+    """Put two fingers side by side about the middle of something, so far apart, and spread or shift them; let go."""
+    box = pane.bounding_box()
+    assert box is not None
+    middle = np.array([box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
+    fingers = page.context.new_cdp_session(page)
+
+    def touch(kind: str, part: float) -> None:
+        half = (spread_px[0] + part * (spread_px[1] - spread_px[0])) / 2
+        places = [middle + part * np.array(shift) + np.array([side * half, 0.0]) for side in (-1, 1)]
+        points = [{"x": float(x), "y": float(y), "id": number} for number, (x, y) in enumerate(places)]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points if kind != "touchEnd" else []})
+
+    touch("touchStart", 0.0)
+    for part in np.linspace(0, 1, 11)[1:]:
+        touch("touchMove", float(part))
+    touch("touchEnd", 1.0)
+    fingers.detach()

@@ -13,9 +13,9 @@ from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
 from app.scene3d import line_colours
-from tests.browser.hands import Placement, fitted, zoomed
+from tests.browser.hands import Placement, centre_of, drawn, finger, fitted, pinch, zoomed
 from tests.browser.live import ask, ask_bytes, eventually, free_port, serving, watched
-from tests.browser.steps import FRAME_SIZE, pane, pixels, ready
+from tests.browser.steps import FRAME_SIZE, pane, pixels, ready, saved
 
 # What each page shows last.
 SHOWN_LAST = {
@@ -158,6 +158,69 @@ def led(page: Page, pages: str, source: str, to: str, points: list[list[float]])
         headers={"X-Rooftrack": "1", "Origin": pages.split("/p/")[0]},
     )
     return np.array(answer.json()["points"])
+
+
+@pytest.mark.parametrize(("width", "height"), [(960, 540), (720, 450)])  # 200 % of 1920 x 1080, and of 1440 x 900
+def test_no_curve_goes_unnamed_where_letters_are_twice_as_large(browser, pages, width, height):
+    cut_off = """() => [...document.querySelectorAll(".plot-title, .plot-entry")].filter((words) => {
+        const [box, head] = [words, words.closest(".plot-head")].map((element) => element.getBoundingClientRect());
+        const legend = words.closest(".plot-legend")?.getBoundingClientRect() ?? head;
+        return words.scrollWidth > words.clientWidth || box.right > head.right + 1 || box.bottom > legend.bottom + 1;
+    }).map((words) => words.textContent)"""
+    with watched(browser, pages, viewport={"width": width, "height": height}) as page:
+        for step in ("review", "drift", "export"):
+            page.goto(f"{pages}/{step}")
+            expect(page.locator(SHOWN_LAST.get(step, ".review-frame[data-whole=true]")).first).to_be_visible()
+            eventually(lambda: page.evaluate(cut_off) == [])
+
+
+def test_two_fingers_move_and_zoom_a_picture_and_place_nothing(browser, pages):
+    with watched(browser, pages, has_touch=True) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        frame = pane(page, "Reference frame")
+        before = fitted(page, frame, FRAME_SIZE)
+        pairs = page.locator("#pairs tbody tr").count()
+        moved_px = np.array([30.0, 20.0])
+        pinch(page, frame, (80, 240), shift=tuple(moved_px))
+        drawn(page, frame, 3 * before.scale)
+        # What lay in the middle lies where the fingers' middle came to.
+        middle = np.array([FRAME_SIZE[0] / 2, FRAME_SIZE[1] / 2]) - 0.5
+        expected = Placement(3 * before.scale, before.window(middle) + moved_px - 3 * before.scale * (middle + 0.5))
+        clicked = ask(pages, "")["project"]["correspondences"][0]
+        at = centre_of(frame.locator(f"[data-id='pair-{clicked['id']}']"))
+        np.testing.assert_allclose(at, expected.window(np.array(clicked["frame_px"])), atol=1.5)
+        pinch(page, frame, (120, 120), shift=(40.0, 0.0))
+        drawn(page, frame, 3 * before.scale)
+        assert page.locator("#pairs tbody tr").count() == pairs
+        assert len(ask(pages, "")["project"]["correspondences"]) == pairs
+
+
+def test_a_finger_grabs_what_it_covers(browser, measured):
+    with watched(browser, measured[1], has_touch=True) as page:
+        page.goto(f"{measured[1]}/correspondences")
+        ready(page, "Reference frame")
+        frame = pane(page, "Reference frame")
+        placed = fitted(page, frame, FRAME_SIZE)
+        pair = ask(measured[1], "")["project"]["correspondences"][2]
+        beside = placed.window(np.array(pair["frame_px"])) + [-20.0, 0.0]
+        finger(page, beside, (-30.0, 24.0))
+        saved(page)
+        moved = ask(measured[1], "")["project"]["correspondences"][2]
+        by_px = placed.window(np.array(moved["frame_px"])) - placed.window(np.array(pair["frame_px"]))
+        np.testing.assert_allclose(by_px, [-30, 24], atol=0.6)
+
+
+def test_two_fingers_zoom_a_plot_and_choose_no_frame(browser, pages):
+    with watched(browser, pages, has_touch=True) as page:
+        page.goto(f"{pages}/review?frame=100")
+        expect(page.locator(".review-frame[data-frame='100']")).to_be_attached()
+        plot = page.locator(".plot-body").first
+        page.wait_for_timeout(500)
+        before = plot.screenshot()
+        pinch(page, plot, (60, 240))
+        eventually(lambda: plot.screenshot() != before)
+        assert page.url.endswith("frame=100")
 
 
 def test_the_scene_follows_the_player_and_exaggerates_the_motion(browser, pages):

@@ -132,7 +132,7 @@ def test_compressed_pcd_is_read_with_open3d(tmp_path):
 def test_without_open3d_one_sentence_names_the_packages(tmp_path, monkeypatch):
     (tmp_path / "c.pcd").write_text(
         "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
-        "WIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA binary_compressed\n"
+        "WIDTH 1\nHEIGHT 1\nPOINTS 0\nDATA binary_compressed\n\0\0\0\0\0\0\0\0"
     )
     original = builtins.__import__
 
@@ -156,6 +156,19 @@ def test_text_without_names_is_understood_by_its_number_of_columns(tmp_path):
     normals = np.column_stack([SAMPLE, np.tile([0.0, -0.6, 0.8], (500, 1))])
     np.savetxt(tmp_path / "n.xyz", normals, fmt="%.6f")
     assert read_cloud(tmp_path / "n.xyz").colour is None
+
+
+@pytest.mark.parametrize("separator", [";", " ", "\t"])
+def test_decimal_commas_are_read_where_commas_separate_no_columns(tmp_path, separator):
+    rows = [separator.join(f"{value:.3f}".replace(".", ",") for value in row) for row in SAMPLE]
+    (tmp_path / "a.txt").write_text(separator.join(["X", "Y", "Z"]) + "\n" + "\n".join(rows))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.txt").world_m, SAMPLE, atol=1e-6)
+
+
+def test_names_of_columns_may_stand_in_a_comment(tmp_path):
+    for mark in ("#", "//", "# ", "// "):
+        (tmp_path / "a.txt").write_text(f"# made here\n{mark}x y z\n1 2 3\n4 5 6\n")
+        assert len(read_cloud(tmp_path / "a.txt")) == 2
 
 
 def test_noise_is_left_out_and_said_so(tmp_path):
@@ -199,6 +212,28 @@ def with_word(file):
     file.write_text("\n".join(lines))
 
 
+def changed(name, old, new):
+    """Return what writes the file `name` would be with one stretch of its bytes changed."""
+
+    def write(file):
+        whole = file.with_name(name)
+        {".las": write_las, ".laz": write_las, ".ply": write_ply, ".pcd": write_pcd}[whole.suffix](whole)
+        content = whole.read_bytes()
+        assert old in content
+        file.write_bytes(content.replace(old, new, 1))
+
+    return write
+
+
+def with_endless_chunk_table(file):
+    write_las(file)
+    content = bytearray(file.read_bytes())
+    (points,) = struct.unpack_from("<I", content, 96)
+    (table,) = struct.unpack_from("<q", content, points)
+    struct.pack_into("<I", content, table + 4, 2**32 - 1)
+    file.write_bytes(content)
+
+
 REFUSED = [
     ("none.laz", lambda file: None, "not found"),
     ("empty.laz", lambda file: file.touch(), "is empty"),
@@ -214,16 +249,32 @@ REFUSED = [
     ("cut.e57", cut("a.e57", 0.6), "damaged or no E57"),
     ("nopoints.las", lambda file: write_las(file, xyz=np.empty((0, 3)), colours=None), "0 points"),
     ("nopoints.csv", lambda file: file.write_text("x,y,z\n"), "holds no points"),
-    ("nan.xyz", with_nan, r"1 points have coordinates that are not finite, the first is point 41"),
+    ("nan.xyz", with_nan, r"1 points have coordinates that are not finite or .*, the first is point 41"),
+    ("far.xyz", lambda file: file.write_text("1 2 3\n1e12 5 6\n"), r"no place on Earth, the first is point 1"),
+    ("utf16.xyz", lambda file: file.write_text("1 2 3\n", encoding="utf-16"), "is text in UTF-16; save it as UTF-8"),
     ("word.xyz", with_word, "line 42 does not hold 3 numbers"),
     ("two.csv", lambda file: file.write_text("1,2\n3,4\n"), "line 1 is neither names of columns"),
     ("five.csv", lambda file: file.write_text("1,2,3,4,5\n"), "has 5 columns without names"),
-    ("comma.xyz", lambda file: file.write_text("12,345;6,789;0,012\n"), "line 1 has decimal commas"),
-    ("commas.txt", lambda file: file.write_text("x y z\n12,345 6,789 0\n"), "line 2 has decimal commas"),
+    ("comma.xyz", lambda file: file.write_text("12,345, 6,789, 0,012\n"), "line 1 has decimal commas"),
+    ("commas.txt", lambda file: file.write_text("x y z\n12,345, 6,789, 0\n"), "line 2 has decimal commas"),
     ("noz.ply", lambda file: file.write_bytes(
         b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\nend_header\n"
         + struct.pack("<ff", 1, 2)), "has no column z"),
     ("head.pcd", lambda file: file.write_text("VERSION 0.7\nDATA ascii\n1 2 3\n"), "PCD header is incomplete"),
+    ("cut.las", cut("a.las", 0.6), r"ends after \d+ of 500 points"),
+    ("short.laz", cut("a.laz", 0.05), "ends before the table of its compressed chunks"),
+    ("chunks.laz", with_endless_chunk_table, "table of its compressed chunks is damaged"),
+    ("scale.las", changed("a.las", struct.pack("<d", 0.001), struct.pack("<d", np.nan)), "scales or offsets"),
+    ("flat.las", changed("a.las", struct.pack("<d", 0.001), struct.pack("<d", 0)), "scales or offsets"),
+    ("less.ply", changed("a.ply", b"vertex 500", b"vertex -5"), "header line `element vertex -5` is not PLY"),
+    ("more.ply", changed("a.ply", b"vertex 500", b"vertex 500000000000000"), "ends after 500 of 500000000000000"),
+    ("twice.ply", changed("a.ply", b"double y", b"double x"), "header is inconsistent"),
+    ("less.pcd", changed("a.pcd", b"POINTS 501", b"POINTS -1"), "PCD header is incomplete or inconsistent"),
+    ("more.pcd", changed("a.pcd", b"POINTS 501", b"POINTS 501000000000000"), "ends after 501 of 501000000000000"),
+    ("twice.pcd", changed("a.pcd", b"FIELDS x y", b"FIELDS x x"), "header is inconsistent"),
+    ("size.pcd", changed("a.pcd", b"SIZE 8 8", b"SIZE 8 3"), "PCD header is incomplete or inconsistent"),
+    ("zip.pcd", changed("a.pcd", b"DATA binary", b"DATA zip"), 'says "DATA zip"'),
+    ("cut2.pcd", changed("a.pcd", b"DATA binary", b"DATA binary_compressed"), "ends before its compressed points do"),
 ]  # fmt: skip
 
 
@@ -259,6 +310,12 @@ def test_thinning_is_even_repeatable_and_keeps_columns_together():
     np.testing.assert_array_equal(few.points_m, thin(coloured, 5000).points_m)
     np.testing.assert_array_equal(few.intensity, few.points_m[:, 2].astype(np.float32))
     assert thin(few, 5000) is few
+
+
+def test_a_stray_echo_far_away_leaves_room_for_the_site():
+    whole = site(60_000)
+    with_echo = Cloud(np.vstack((whole.points_m, [[30_000.0, 0.0, 0.0]])), whole.origin_m)
+    assert 2500 < len(thin(with_echo, 5000)) <= 5000
 
 
 def test_a_cloud_cannot_be_written_to(building):

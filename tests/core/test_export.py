@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
@@ -15,12 +16,12 @@ import pytest
 from core import export
 from core.errors import InputError
 from core.export import Results, fitted_lines, write_results
+from core.gps_record import GpsRecord
 from core.project import Project
 from core.report import ReportFigure
 from core.results import read_history_csv
 from core.solution import Solution
 from core.solve import solve
-from core.validation import GpsRecord
 from tests import exact_scene as scene
 from tests.small_project import write_video
 
@@ -57,6 +58,7 @@ def results(video: Path, project: Project, solution: Solution, **changes: Any) -
         solution=solution,
         gps=None,
         video=video,
+        announced_s=scene.FRAMES / scene.RATE_HZ,
         sha256={"video.mp4": "ab" * 32, "lens.yaml": "cd" * 32, "gps.csv": "ef" * 32},
         identity={"video.mp4": "12" * 32, "lens.yaml": "34" * 32, "gps.csv": "56" * 32},
         version="0.1.0",
@@ -315,3 +317,29 @@ def test_lines_are_drawn_where_they_lie() -> None:
 def test_nothing_is_drawn_with_before_it_must_be() -> None:
     code = "import sys, core.export; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=False).returncode == 0
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_video_that_ends_before_it_says_is_told(video: Path, tmp_path: Path) -> None:
+    made = results(video, scene.project_document(), solved(), announced_s=scene.FRAMES / scene.RATE_HZ + 2)
+    warnings = write_results(tmp_path, made)["warnings"]
+    assert warnings[0].startswith("video.mp4: says that it lasts")
+    assert warnings[0].endswith("as in a file that was cut off; copy it again.")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_results_that_find_no_room_leave_the_earlier_ones(
+    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = results(video, scene.project_document(), solved())
+    write_results(tmp_path, made)
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+
+    def no_room(path: Path, summary: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(export, "write_summary", no_room)
+    with pytest.raises(OSError, match="No space left") as refused:
+        write_results(tmp_path, replace(made, version="0.2.0"))
+    assert refused.value.filename == str(tmp_path)
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before

@@ -12,10 +12,11 @@ from matplotlib.figure import Figure
 from core import figures
 from core.coordinates import Floats
 from core.drift import amplitude_spectrum, corner_sweep, high_pass
+from core.gps_record import GpsRecord
 from core.intervals import within
 from core.project import Drift, Intervals
 from core.results import TargetHistory
-from core.validation import GpsComparison, GpsRecord, compare_with_gps
+from core.validation import GpsComparison, compare_with_gps
 
 INTERVALS = Intervals(pre_event=(0.0, 5.0), event=(6.0, 14.0), residual=(15.0, 20.0))
 TIME_S = np.arange(600) / 30

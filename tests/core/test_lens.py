@@ -168,6 +168,14 @@ def test_file_of_opencvs_own_samples_with_four_coefficients(tmp_path):
             "cols: 2\n   dt: d\n   data: [ 1., 2. ]",
             "holds 2 numbers; it must hold k1 k2 p1 p2",
         ),
+        ("1500., 0., 960.", "3.6, 0., 960.", "focal lengths of 3.6 and .*; write them in pixels, not in millimetres"),
+        ("image_width: 1920", "readout_s: 20\nimage_width: 1920", "readout_s is 20, but no camera takes 1 s"),
+        (
+            "image_width: 1920",
+            'distortion_model: "equidistant"\nimage_width: 1920',
+            "distortion_model is equidistant; calibrate with k1 k2 p1 p2 k3 only",
+        ),
+        (GOOD, "[1, 2]", "is not an OpenCV FileStorage file"),
         (GOOD, "", "is not an OpenCV FileStorage file"),
         (GOOD, "just words", "is not an OpenCV FileStorage file"),
     ],
@@ -181,10 +189,35 @@ def test_a_wrong_file_is_refused_by_name(tmp_path, old, new, message):
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.parametrize(
+    ("matrix", "coefficients"),
+    [
+        ("[1500, 0, 960, 0, 1500, 540, 0, 0, 1]", "[0.1, -0.05, 0, 0]"),
+        ("[[1500, 0, 960], [0, 1500, 540], [0, 0, 1]]", "[0.1, -0.05, 0, 0, 0, 0, 0, 0]"),
+        (
+            "\n  rows: 3\n  cols: 3\n  data: [1500, 0, 960, 0, 1500, 540, 0, 0, 1]\ndistortion_model: plumb_bob",
+            "\n  rows: 1\n  cols: 5\n  data: [0.1, -0.05, 0, 0, 0]",
+        ),
+    ],
+    ids=["lists", "lists in lists, no more coefficients than five", "ROS"],
+)
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+def test_what_other_programs_write_is_read(tmp_path, matrix, coefficients, encoding):
+    file = tmp_path / "lens.yaml"
+    text = (
+        "# Größe\nimage_width: 1920\nimage_height: 1080\n"
+        f"camera_matrix: {matrix}\ndistortion_coefficients: {coefficients}\n"
+    )
+    file.write_bytes(text.encode(encoding))
+    lens = read_lens(file)
+    np.testing.assert_array_equal(lens.camera_matrix, [[1500, 0, 960], [0, 1500, 540], [0, 0, 1]])
+    np.testing.assert_array_equal(lens.distortion, [0.1, -0.05, 0, 0, 0])
+
+
 def test_missing_and_binary_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="not found; calibrate"):
         read_lens(tmp_path / "none.yaml")
-    (tmp_path / "lens.yaml").write_bytes(b"\xff\xfe\x00\x01")
+    (tmp_path / "lens.yaml").write_bytes(b"\x89PNG\r\n\x1a\n\x00")
     with pytest.raises(InputError, match="cannot be read as text"):
         read_lens(tmp_path / "lens.yaml")
 

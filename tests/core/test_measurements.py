@@ -185,3 +185,9 @@ def test_a_file_that_is_something_else_is_refused_and_kept(tmp_path: Path) -> No
     with pytest.raises(InputError, match=r"frames\.sqlite: is not readable .* delete it, it can be measured again"):
         MeasurementStore(file)
     assert file.read_bytes().startswith(b"this is no database")
+
+
+def test_a_file_that_cannot_be_opened_is_not_to_be_deleted(tmp_path: Path) -> None:
+    (tmp_path / "frames.sqlite").mkdir()
+    with pytest.raises(InputError, match=r"frames\.sqlite: cannot be opened .* make room for it, or move away what is"):
+        MeasurementStore(tmp_path / "frames.sqlite")

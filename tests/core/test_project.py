@@ -139,6 +139,12 @@ def test_mistakes_in_the_file_are_told_with_its_folder() -> None:
 
 
 def test_a_file_that_is_not_text(tmp_path: Path) -> None:
-    (tmp_path / "project.json").write_bytes(b"\xff\xfe\x00")
+    (tmp_path / "project.json").write_bytes(b"\xff\xfe\x00")  # UTF-16 that breaks off in a character
     with pytest.raises(InputError, match=r"project\.json: cannot be read .*; restore it from a copy"):
         read_project(tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+def test_a_file_saved_by_another_editor(tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "project.json").write_bytes(project_json(Project.model_validate(changed(name="Höhe"))).encode(encoding))
+    assert read_project(tmp_path).name == "Höhe"

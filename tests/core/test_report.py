@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from core.georeference import ReferenceFit, fit_reference
+from core.gps_record import GpsRecord
 from core.lens import Lens
 from core.project import Correspondence, Project, parse_project
 from core.report import (
@@ -25,7 +26,7 @@ from core.report import (
     report_html,
     write_report,
 )
-from core.validation import GpsRecord, compare_with_gps
+from core.validation import compare_with_gps
 
 NASTY = "<script>alert(\"1\")</script> & 'roof'"
 PNG = b"\x89PNG\r\n\x1a\nnot really"

@@ -184,7 +184,8 @@ def test_a_file_that_cannot_be_written_stays_as_it_was_and_leaves_no_part(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", no_room)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match="No space left") as refused:
         write_atomically(file, b"new")
+    assert refused.value.filename == str(file)
     assert file.read_bytes() == b"old"
     assert [each.name for each in file.parent.iterdir()] == ["file.json"]

@@ -1,14 +1,13 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from core.coordinates import Floats
 from core.errors import InputError
-from core.project import GpsInput, Intervals
-from core.validation import GpsRecord, compare_with_gps, read_gps
+from core.gps_record import GpsRecord
+from core.project import Intervals
+from core.validation import compare_with_gps
 
 INTERVALS = Intervals(pre_event=(0.0, 9.0), event=(10.0, 24.0), residual=(27.0, 30.0))
 ORIGIN_M = np.array([477_000.0, 3_637_000.0])
@@ -72,6 +71,17 @@ def test_times_in_milliseconds_share_nothing_with_the_video() -> None:
     record = gps_with_lag(-5.0)
     with pytest.raises(InputError, match="share nothing with the measured video"):
         compare_with_gps(time_s, moved, GpsRecord("gps.csv", 1000 * record.time_s + 60e3, record.position_m), INTERVALS)
+
+
+@pytest.mark.parametrize(
+    ("unit", "in_a_metre"), [("millimetres", 1000), ("centimetres", 100), ("feet", 3.2808), ("degrees", 1 / 95_000)]
+)
+def test_positions_in_another_unit_are_told_by_how_much_they_move(unit: str, in_a_metre: float) -> None:
+    time_s, moved = video()
+    record = gps_with_lag(-5.0)
+    in_unit = GpsRecord("gps.csv", record.time_s, in_a_metre * record.position_m)
+    with pytest.raises(InputError, match=rf"^gps\.csv: its positions move .* as if they were in {unit}; convert them"):
+        compare_with_gps(time_s, moved, in_unit, INTERVALS)
 
 
 def test_lag_survives_drift_offset_and_lost_frames() -> None:
@@ -208,97 +218,3 @@ def test_largest_lag_is_respected() -> None:
     time_s, moved = video()
     comparison = compare_with_gps(time_s, moved, gps_with_lag(9.0), INTERVALS, max_lag_s=2.0)
     assert abs(comparison.lag_s) <= 2.0
-
-
-def write(folder: Path, text: str) -> Path:
-    file = folder / "gps.csv"
-    file.write_text(text, encoding="utf-8")
-    return file
-
-
-def settings(**names: str) -> GpsInput:
-    return GpsInput(file="gps.csv", **names)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_reads_named_columns_and_passes_over_the_rest(tmp_path: Path, separator: str) -> None:
-    rows = ["\ufeff# station CENT", "time_s,up_m,north_m,east_m", "0.0,9,2.5,1.5", "", "0.1,9,2.6,1.6", "0.2,x,2.7,1.7"]
-    file = write(tmp_path, "\n".join([*rows, "0.3,9,2.8,1.8"]).replace(",", separator) + "\n")
-    record = read_gps(file, settings())
-    np.testing.assert_allclose(record.time_s, [0, 0.1, 0.2, 0.3])
-    np.testing.assert_allclose(record.position_m, [[1.5, 2.5], [1.6, 2.6], [1.7, 2.7], [1.8, 2.8]])
-    assert not record.position_m.flags.writeable
-
-
-@pytest.mark.parametrize(
-    ("body", "message"),
-    [
-        ("t,e,n\n0,1,2\n", r'gps\.csv: has no column "time_s" \(found "t", "e", "n"\).*inputs\.gps\.time'),
-        ("time_s,east_m,north_m\n0,1,2\n0.1,oops,2\n", r'line 3: "east_m" is "oops", not a number; correct or remove'),
-        ("time_s,east_m,north_m\n0,1,2\n0.1,1\n", r'line 3: "north_m" is empty'),
-        ("time_s,east_m,north_m\n0,1,2\n0.1,1,nan\n", r'line 3: "north_m" is "nan", not a number'),
-        ("time_s,east_m,north_m\n0,1,2\n1,1,2\n", r"has 2 positions; at least four"),
-        (
-            "time_s,east_m,north_m\n0,1,2\n2,1,2\n\n1,1,2\n3,1,2\n",
-            r'line 5: "time_s" is 1, not after the line before \(2\)',
-        ),
-        (
-            "time_s,east_m,north_m\n0,1,2\n# receiver on\n1700000000,1,2\n1700000000.5,1,2\n1700000001,1,2\n",
-            r"line 4: its time is 1\.7e\+09 s after that of the line before, 0 s, .* 0\.5 s apart; correct the times",
-        ),
-        (
-            "time_s,east_m,north_m\n0,1,2\n12:00 o'clock,1,2\n",
-            r'line 3: "time_s" is "12:00 o\'clock", not a number or a time such as 2026-03-01T12:00:00\.250Z',
-        ),
-        (
-            "time_s,east_m,north_m\n12:00:00,1,2\n12:00:01,1,2\n2.5,1,2\n12:00:03,1,2\n",
-            r'line 4: "time_s" is a number, but a time of day in the lines before; write all alike',
-        ),
-        (
-            "time_s,east_m,north_m\n2026-03-01 12:00,1,2\n2026-03-01 12:01Z,1,2\n2026-03-01 12:02,1,2\n"
-            "2026-03-01 12:03,1,2\n",
-            r"line 3: .* is a date and time with its time zone, but a date and time in the lines before",
-        ),
-        (
-            "time_s,east_m,north_m\n12:00:01,1,2\n12:00:03,1,2\n12:00:02,1,2\n12:00:04,1,2\n",
-            r'line 4: "time_s" is 1, not after the line before \(2\)',
-        ),
-        ("", r"is empty"),
-    ],
-)
-def test_bad_records_are_refused_by_line(tmp_path: Path, body: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_gps(write(tmp_path, body), settings())
-
-
-@pytest.mark.parametrize(
-    "start",
-    [
-        "2026-03-01T23:59:59.{}Z",
-        "2026-03-01 23:59:59.{}",
-        "2026-03-01T23:59:59,{}+09:00",
-        "20260301T235959.{}Z",
-        "23:59:59.{}",
-    ],
-)
-def test_dates_and_times_of_day_count_from_the_first_to_the_microsecond(tmp_path: Path, start: str) -> None:
-    midnight = start.replace("23:59:59", "00:00:00").replace("235959", "000000").replace("03-01", "03-02")
-    midnight = midnight.replace("0301", "0302")
-    texts = [start.format("25"), start.format("250001"), start.format("999999"), midnight.format("000")]
-    body = "\n".join(["time_s;east_m;north_m", *(f"{text};1;2" for text in texts)])
-    time_s = read_gps(write(tmp_path, body), settings()).time_s
-    assert time_s.tolist() == [0.0, 1e-6, 0.749999, 0.75]
-
-
-def test_a_record_may_have_a_gap_of_days(tmp_path: Path) -> None:
-    days_s = 3 * 86_400
-    body = "time_s,east_m,north_m\n" + "".join(f"{time_s},1,2\n" for time_s in (0, 0.1, 0.2, days_s, days_s + 0.1))
-    assert len(read_gps(write(tmp_path, body), settings()).time_s) == 5
-
-
-def test_missing_and_binary_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"not found; correct inputs\.gps\.file"):
-        read_gps(tmp_path / "none.csv", settings())
-    (tmp_path / "gps.csv").write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(InputError, match="cannot be read as text"):
-        read_gps(tmp_path / "gps.csv", settings())

@@ -6,6 +6,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 from av.stream import Disposition
@@ -214,6 +215,34 @@ def test_no_such_file(tmp_path: Path) -> None:
     for read in (probe, frame_index, lambda file: read_frame(file, 0)):
         with pytest.raises(InputError, match=r"gone\.mp4: not found; correct inputs\.video"):
             read(tmp_path / "gone.mp4")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
+def test_a_picture_is_no_film_whatever_it_is_called(tmp_path: Path, suffix: str) -> None:
+    file = tmp_path / "video.mp4"
+    file.write_bytes(cv2.imencode(suffix, picture(0))[1].tobytes())
+    with pytest.raises(InputError, match=r"video\.mp4: is a picture and no video"):
+        probe(file)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pix_fmt", "called"),
+    [
+        ("video.mp4", "libx265", "yuv420p10le", "hevc"),
+        ("video.mov", "libx264", "yuv422p10le", "h264"),
+        ("video.mp4", "libx264", "yuv444p", "h264"),
+        ("video.webm", "libvpx-vp9", "yuv420p", "vp9"),
+        ("video.mkv", "libsvtav1", "yuv420p", "av1"),
+        ("video.mkv", "mpeg4", "yuv420p", "mpeg4"),
+    ],
+)
+def test_other_codecs_and_depths_give_all_their_frames(
+    tmp_path: Path, name: str, codec: str, pix_fmt: str, called: str
+) -> None:
+    options = {"bf": "0", "preset": "8", "crf": "20"} if codec == "libsvtav1" else {"bf": "0"}
+    file = write(tmp_path / name, codec=codec, pix_fmt=pix_fmt, size=(192, 128), options=options)
+    assert probe(file).codec == called
+    assert [number_of(frame.luma) for frame in read_frames(file)] == list(range(FRAMES))
 
 
 def test_no_video_at_all(tmp_path: Path) -> None:

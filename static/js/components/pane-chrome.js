@@ -39,7 +39,8 @@ export function paneChrome(pane, { title, readout }) {
   pane.on("click", () => {
     if (pane.image !== null || note.hidden) return;
     note.getAnimations().forEach((animation) => animation.cancel());
-    note.animate([{ scale: 1 }, { scale: 1.05 }, { scale: 1 }], { duration: 260, easing: "ease-out" });
+    if (!matchMedia("(prefers-reduced-motion: reduce)").matches)
+      note.animate([{ scale: 1 }, { scale: 1.05 }, { scale: 1 }], { duration: 260, easing: "ease-out" });
     note.dataset.clicks = String(Number(note.dataset.clicks ?? 0) + 1);
     announce(`Nothing was placed. ${note.firstChild?.textContent ?? ""}`);
   });

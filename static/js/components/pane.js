@@ -1,9 +1,10 @@
 // Image pane: pan, zoom and grab, exact to the pixel. One canvas for pixels, one SVG for shapes.
 // It speaks image px only; canvas px stay inside (see lib/coordinates.js). No modes: a press on a shape that can be
-// grabbed drags it, a press elsewhere pans, and a press that does not move is a click.
+// grabbed drags it, a press elsewhere pans, and a press that does not move is a click. Two fingers pan and zoom.
 
 import { Emitter } from "../lib/emitter.js";
 import { h } from "../lib/dom.js";
+import { Fingers } from "../lib/fingers.js";
 import { View, add, canvasPoint, distance, subtract } from "../lib/coordinates.js";
 import { ShapeLayer, shapeAt } from "./shapes.js";
 
@@ -26,6 +27,7 @@ import { ShapeLayer, shapeAt } from "./shapes.js";
  */
 
 const STILL_PX = 3;
+const FINGER = 1.7; // a finger grabs from so many times as far as a mouse: from within 24 px, as wide as a fingertip
 const TRUE_PIXELS_FROM = 3; // device px per image px above which pixels are shown as squares
 
 /** @extends {Emitter<PaneEvents>} */
@@ -43,6 +45,7 @@ export class Pane extends Emitter {
   #lastClick = { time: 0, at: /** @type {Point} */ ([0, 0]) };
   /** @type {{at: Point, last: Point, moved: boolean, shape: Shape | null, from: Point, pointer: number} | null} */
   #press = null;
+  #fingers = new Fingers();
 
   /**
    * @param {HTMLElement} element
@@ -240,8 +243,11 @@ export class Pane extends Emitter {
     element.addEventListener("pointerdown", (event) => this.#onDown(event));
     element.addEventListener("pointermove", (event) => this.#onMove(event));
     element.addEventListener("pointerup", (event) => this.#onUp(event));
-    element.addEventListener("pointercancel", () => this.#giveUp());
-    element.addEventListener("lostpointercapture", () => this.#giveUp());
+    for (const name of /** @type {const} */ (["pointercancel", "lostpointercapture"]))
+      element.addEventListener(name, (event) => {
+        this.#fingers.up(event);
+        this.#giveUp();
+      });
     element.addEventListener("pointerleave", () => this.#hover(null, null));
     element.addEventListener("focus", () => (this.usedAt = performance.now()));
     element.addEventListener("keydown", (event) => {
@@ -266,13 +272,19 @@ export class Pane extends Emitter {
     if (event.button > 1) return;
     this.element.focus({ preventScroll: true });
     this.element.setPointerCapture(event.pointerId);
+    this.#fingers.down(event);
+    if (this.#fingers.isPinch) return this.#giveUp();
     const at = canvasPoint(event, this.element);
-    const shape = event.button === 0 ? shapeAt(this.#shapes, this.view, at) : null;
+    const generosity = event.pointerType === "touch" ? FINGER : 1;
+    const shape = event.button === 0 ? shapeAt(this.#shapes, this.view, at, generosity) : null;
     this.#press = { at, last: at, moved: false, shape, from: shape?.points[0] ?? [0, 0], pointer: event.pointerId };
   }
 
   /** @param {PointerEvent} event */
   #onMove(event) {
+    const pinch = this.#fingers.moved(event);
+    if (pinch !== null) this.#pinch(pinch);
+    if (this.#fingers.isPinch) return;
     const at = canvasPoint(event, this.element);
     const press = this.#press;
     if (press === null) return this.#hover(at, shapeAt(this.#shapes, this.view, at));
@@ -285,8 +297,15 @@ export class Pane extends Emitter {
     this.#hover(at, press.shape);
   }
 
+  /** @param {import("../lib/fingers.js").Pinch} pinch */
+  #pinch({ shift, middle, factor }) {
+    const box = this.element.getBoundingClientRect();
+    this.setView(this.view.pannedBy(...shift).zoomedAt(subtract(middle, [box.left, box.top]), factor));
+  }
+
   /** @param {PointerEvent} event */
   #onUp(event) {
+    this.#fingers.up(event);
     const press = this.#press;
     this.#press = null;
     this.element.classList.remove("panning", "dragging");

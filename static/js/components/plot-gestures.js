@@ -1,5 +1,7 @@
 // Pointer, wheel and keys of a plot. No modes: a drag does the plot's own business, the wheel zooms at the cursor,
-// Alt or the middle button pans, a double click shows all.
+// Alt or the middle button pans, two fingers pan and zoom, a double click shows all.
+
+import { Fingers } from "../lib/fingers.js";
 
 /** @typedef {import("./plot.js").Plot} Plot */
 
@@ -8,8 +10,9 @@ const MOVED_PX = 3;
 /** @param {Plot} plot */
 export function attachGestures(plot) {
   const { body } = plot;
+  const fingers = new Fingers();
   body.addEventListener("wheel", (event) => wheel(plot, event), { passive: false });
-  body.addEventListener("pointerdown", (event) => press(plot, event));
+  body.addEventListener("pointerdown", (event) => press(plot, fingers, event));
   body.addEventListener("dblclick", () => plot.setView(null));
   body.addEventListener("keydown", (event) => key(plot, event));
 }
@@ -40,6 +43,12 @@ function zoom(plot, at, factor) {
   showPixels(plot, at - at * factor, at + (width - at) * factor);
 }
 
+/** @param {Plot} plot @param {import("../lib/fingers.js").Pinch} pinch */
+function pinch(plot, { shift, middle, factor }) {
+  pan(plot, -shift[0]);
+  zoom(plot, middle[0] - plot.u.over.getBoundingClientRect().left, 1 / factor);
+}
+
 /** Move along x as far as the data goes. @param {Plot} plot @param {number} by CSS px */
 function pan(plot, by) {
   const [low, high] = plot.whole;
@@ -58,8 +67,8 @@ function showPixels(plot, left, right) {
   plot.setView(from <= low && to >= high ? null : [from, to]);
 }
 
-/** @param {Plot} plot @param {PointerEvent} event */
-function press(plot, event) {
+/** @param {Plot} plot @param {Fingers} fingers @param {PointerEvent} event */
+function press(plot, fingers, event) {
   const nothing = (plot.data[0]?.length ?? 0) === 0;
   if (nothing || event.button > 1 || !plot.u.over.contains(/** @type {Node} */ (event.target))) return;
   const own = plot.options.drag ?? "view";
@@ -67,17 +76,28 @@ function press(plot, event) {
   const action = event.button === 1 || event.altKey ? "view" : event.shiftKey && own !== "view" ? other : own;
   const start = { x: valueAt(plot, event), px: event.clientX, moved: false, last: event.clientX };
   plot.body.setPointerCapture(event.pointerId);
-  if (action === "seek") plot.emit("seek", { x: start.x });
+  fingers.down(event);
+  if (fingers.isPinch) plot.u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+  const atOnce = action === "seek" && event.pointerType !== "touch"; // a second finger may follow the first
+  if (atOnce) plot.emit("seek", { x: start.x });
   const move = (/** @type {PointerEvent} */ now) => {
+    if (now.pointerId !== event.pointerId) return;
+    const pinched = fingers.moved(now);
+    if (pinched !== null) pinch(plot, pinched);
+    if (fingers.isPinch) return;
     start.moved ||= Math.abs(now.clientX - start.px) > MOVED_PX;
     if (start.moved) drag(plot, action, start, now);
   };
   const end = (/** @type {PointerEvent} */ now) => {
+    if (now.pointerId !== event.pointerId) return;
+    const wasPinch = fingers.isPinch;
+    fingers.up(now);
     plot.body.removeEventListener("pointermove", move);
     plot.body.removeEventListener("pointerup", end);
     plot.body.removeEventListener("pointercancel", end);
     plot.u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
-    if (!start.moved && action !== "seek") plot.emit("seek", { x: start.x });
+    if (wasPinch) return;
+    if (!start.moved && !atOnce) plot.emit("seek", { x: start.x });
     if (start.moved && action === "select" && now.type === "pointerup")
       emitSelection(plot, start.x, valueAt(plot, now));
   };

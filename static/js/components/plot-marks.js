@@ -87,8 +87,15 @@ export function drawVerticals(plot, u) {
     const neighbour = plot.verticals.some(
       (other) => other.at > vertical.at && u.valToPos(other.at, "x", true) < x + wide,
     );
-    const after = (x + wide < left + width && !neighbour) || x - wide < left;
-    g.fillText(vertical.label, after ? x + 6 * scale : x - wide + 2 * scale, top + 5 * scale);
+    const roomBefore = x - wide >= left;
+    const after = (x + wide < left + width && !neighbour) || !roomBefore;
+    const below = neighbour && !roomBefore; // the neighbour's label begins where this one would end
+    const labelX = after ? x + 6 * scale : x - wide + 2 * scale;
+    const labelY = top + (below ? 21 : 5) * scale;
+    g.fillStyle = plot.faded("--surface", 0.8);
+    g.fillRect(labelX - 2 * scale, labelY - 2 * scale, wide - 4 * scale, 16 * scale);
+    g.fillStyle = plot.colour(vertical.colour);
+    g.fillText(vertical.label, labelX, labelY);
   });
   g.restore();
 }

@@ -92,13 +92,13 @@ export class ShapeLayer {
   }
 }
 
-/** The shape a pointer would grab: points before lines before insides, nearest first. @param {Shape[]} shapes @param {View} view @param {Point} canvas */
-export function shapeAt(shapes, view, canvas) {
+/** The shape a pointer would grab: points before lines before insides, nearest first. @param {Shape[]} shapes @param {View} view @param {Point} canvas @param {number} [generosity] times as far as a mouse */
+export function shapeAt(shapes, view, canvas, generosity = 1) {
   /** @type {{shape: Shape, rank: number, distance: number} | null} */
   let best = null;
   for (const shape of shapes) {
     if (!shape.grab) continue;
-    const found = reach(shape, view, canvas);
+    const found = reach(shape, view, canvas, generosity);
     if (
       found !== null &&
       (best === null || found.rank < best.rank || (found.rank === best.rank && found.distance <= best.distance))
@@ -108,10 +108,10 @@ export function shapeAt(shapes, view, canvas) {
   return best?.shape ?? null;
 }
 
-/** @param {Shape} shape @param {View} view @param {Point} pointer @returns {{rank: number, distance: number} | null} */
-function reach(shape, view, pointer) {
+/** @param {Shape} shape @param {View} view @param {Point} pointer @param {number} generosity @returns {{rank: number, distance: number} | null} */
+function reach(shape, view, pointer, generosity) {
   const canvas = shape.points.map((point) => view.toCanvas(point));
-  const radius = GRAB_RADIUS[shape.kind];
+  const radius = generosity * GRAB_RADIUS[shape.kind];
   if (shape.kind === "mark" || shape.kind === "handle") {
     const d = distance(canvas[0], pointer);
     return d <= radius ? { rank: 0, distance: d } : null;
