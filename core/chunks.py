@@ -25,7 +25,7 @@ HEAD_START = 18
 # One process keeps two cores busy, decoding and measuring. Others repay their start by so many frames; where they find
 # no idle cores they gain little, and it takes more.
 CORES_EACH = 2
-REPAYING_FRAMES_IDLE = 100
+REPAYING_FRAMES_IDLE = 60
 REPAYING_FRAMES = 500
 # So many processes are started unasked: each takes half a gigabyte at 4K, and more would wait for the decoder's cores.
 USUAL_PROCESSES = 4

@@ -51,5 +51,5 @@ def test_what_lies_on_the_way_to_a_frame_is_decoded_once(tmp_path: Path) -> None
 def test_a_file_that_is_no_video_is_refused_in_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "clip.mp4").write_bytes(b"not a video")
     for number in (0, 3):
-        with pytest.raises(InputError, match=r"clip\.mp4: .*export it again"):
+        with pytest.raises(InputError, match=r"clip\.mp4: .*copy it again if it was cut off, or export it"):
             FrameStore().frame(tmp_path / "clip.mp4", number)

@@ -175,7 +175,7 @@ def test_the_published_way_shows_the_exact_apparent_motion(clip, tmp_path):
 @pytest.fixture
 def many_processes(monkeypatch):
     """Have all workers measure, however short the clip and however few the cores."""
-    monkeypatch.setattr(measuring, "processes_for", lambda frames, workers, cores: workers)
+    monkeypatch.setattr(measuring, "processes_for", lambda frames, workers, cores: workers or 1)
 
 
 @pytest.mark.usefixtures("many_processes")
