@@ -8,6 +8,7 @@ up on a few frames before its first, so that its numbers are those of an uninter
 from __future__ import annotations
 
 import itertools
+import math
 import pickle
 import threading
 from collections.abc import Generator, Iterable, Iterator, Sequence
@@ -232,7 +233,7 @@ def measure(
         # While the reference frame is still looked at, others load and the first chunk is being decoded.
         cluster = stack.enter_context(Cluster(measure_remotely, scheduler)) if scheduler is not None else None
         cores = available_cores()
-        processes = processes_for(len(index) - len(done), workers, cores)
+        processes = processes_for(len(index) - len(done), workers, cores, pixels=math.prod(setup.lens.image_size_px))
         chunks = missing_chunks(done, index, processes, HEAD_START) if cluster is None else []
         before = [_before(store, recording, chunk.start) for chunk in chunks]
         helping = max(0, min(processes, len(chunks)) - 1)

@@ -503,7 +503,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(table(results[-1:], chosen.frames, chosen.long_factor), flush=True)
     text = table(results, chosen.frames, chosen.long_factor)
     text += f"\n\nMedians of {chosen.runs}, {os.cpu_count()} cores; rewritten by `make bench BENCH_OPTIONS=--write`."
-    if processes_for(chosen.frames, 2, available_cores()) == 1:
+    if processes_for(chosen.frames, 2, available_cores(), pixels=0) == 1:
         text += f" With two workers, {chosen.frames} frames are measured by one process here: a second would not repay."
     print(text)
     if chosen.write:

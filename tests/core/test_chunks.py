@@ -58,27 +58,35 @@ def test_nothing_is_missing_when_all_is_done():
     assert missing_chunks(list(range(40)), index_of(40, [0]), 3) == []
 
 
+HD, UHD = 1920 * 1080, 3840 * 2160
+
+
 @pytest.mark.parametrize(
-    ("frames", "workers", "cores", "processes"),
+    ("frames", "workers", "cores", "pixels", "processes"),
     [
-        (300, 2, 2, 1),
-        (2 * REPAYING_FRAMES, 2, 2, 2),
-        (2 * REPAYING_FRAMES, 8, 2, 2),
-        (300, 2, 4, 2),
-        (400, 8, 8, 4),
-        (120, 8, 8, 2),
-        (300, 1, 64, 1),
-        (0, 2, 1, 1),
-        (10_000, None, 1, 1),
-        (10_000, None, 2, 1),
-        (10_000, None, 4, 2),
-        (10_000, None, 64, 4),
-        (130, None, 64, 2),
-        (60, None, 64, 1),
+        (300, 2, 2, UHD, 1),
+        (2 * REPAYING_FRAMES, 2, 2, UHD, 2),
+        (2 * REPAYING_FRAMES, 8, 2, UHD, 2),
+        (300, 2, 4, UHD, 2),
+        (400, 8, 8, UHD, 4),
+        (120, 8, 8, UHD, 2),
+        (300, 1, 64, UHD, 1),
+        (0, 2, 1, UHD, 1),
+        (10_000, None, 1, UHD, 1),
+        (10_000, None, 2, UHD, 1),
+        (10_000, None, 4, UHD, 2),
+        (10_000, None, 64, UHD, 4),
+        (130, None, 64, UHD, 2),
+        (60, None, 64, UHD, 1),
+        (300, None, 2, HD, 1),
+        (10_000, None, 2, HD, 2),
+        (10_000, None, 1, HD, 1),
+        (10_000, None, 4, HD, 4),
+        (10_000, 1, 4, HD, 1),
     ],
 )
-def test_no_process_is_started_that_does_not_repay_it(frames, workers, cores, processes):
-    assert processes_for(frames, workers, cores) == processes
+def test_no_process_is_started_that_does_not_repay_it(frames, workers, cores, pixels, processes):
+    assert processes_for(frames, workers, cores, pixels=pixels) == processes
 
 
 @pytest.mark.parametrize(

@@ -175,7 +175,7 @@ def test_the_published_way_shows_the_exact_apparent_motion(clip, tmp_path):
 @pytest.fixture
 def many_processes(monkeypatch):
     """Have all workers measure, however short the clip and however few the cores."""
-    monkeypatch.setattr(measuring, "processes_for", lambda frames, workers, cores: workers or 1)
+    monkeypatch.setattr(measuring, "processes_for", lambda frames, workers, cores, pixels: workers or 1)
 
 
 @pytest.mark.usefixtures("many_processes")
@@ -312,8 +312,9 @@ def test_two_workers_measure_the_same(clip, history, tmp_path):
     assert largest_difference_m(measured_history(folder, workers=2), history) < SAME_M
 
 
+@pytest.mark.parametrize("workers", [2, None])
 @pytest.mark.parametrize(("cores", "helping"), [(2, 0), (4, 1)])
-def test_a_short_clip_gets_help_only_where_cores_are_idle(clip, tmp_path, monkeypatch, cores, helping):
+def test_a_short_clip_gets_help_only_where_cores_are_idle(clip, tmp_path, monkeypatch, workers, cores, helping):
     counts = []
 
     def counted(work, count):
@@ -323,7 +324,7 @@ def test_a_short_clip_gets_help_only_where_cores_are_idle(clip, tmp_path, monkey
     monkeypatch.setattr(measuring, "available_cores", lambda: cores)
     monkeypatch.setattr(measuring, "Helpers", counted)
     with pytest.raises(Cancelled):
-        measured_history(project_copy(clip, tmp_path / "short"), workers=2)
+        measured_history(project_copy(clip, tmp_path / "short"), workers=workers)
     assert counts == [helping]
 
 
