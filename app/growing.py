@@ -33,10 +33,15 @@ log = logging.getLogger("rooftrack")
 
 @dataclass(eq=False)
 class _Growth:
-    """What is known so far of one running measurement."""
+    """What is known so far of one running measurement.
+
+    Attributes:
+        rows: by target, in the order in which they came: processes measure several parts of a clip at a time.
+        seen: frames that are among them.
+    """
 
     rows: dict[str, list[Row]] = field(default_factory=dict)
-    last_frame: int = -1
+    seen: set[int] = field(default_factory=set)
 
 
 class Growing:
@@ -77,10 +82,11 @@ def _look(hub: Hub, folder: ProjectFolder, inputs: LoadedInputs, growth: _Growth
         number = store.find(inputs.project.method, wanted_fingerprint(inputs.video, inputs.project))
         if number is None:
             return
-        recording = store.load(number, after=growth.last_frame)
-    if len(recording.frame) < LEAST_FRAMES:
-        return
-    growth.last_frame = int(recording.frame[-1])
+        fresh = [frame for frame in store.measured_frames(number) if frame not in growth.seen]
+        if len(fresh) < LEAST_FRAMES:
+            return
+        recording = store.load(number, only=fresh)
+    growth.seen.update(fresh)
     solution = solve(recording, _plain(inputs.project), inputs.lens, inputs.relief, has_lens=inputs.has_lens)
     for name, history in solution.histories.items():
         rows = rows_of(history)

@@ -10,7 +10,7 @@ import json
 import sqlite3
 import time
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -196,12 +196,16 @@ class MeasurementStore:
         row = self._db.execute(query, (recording, frame)).fetchone()
         return None if row is None else _measurement(row, list(self.reference(recording).targets_raw))
 
-    def load(self, recording: int, after: int = -1) -> Recording:
-        """Return everything measured so far of the frames that come after a frame."""
+    def load(self, recording: int, only: Sequence[int] | None = None) -> Recording:
+        """Return everything measured so far, or what is measured of some frames only."""
         reference = self.reference(recording)
         names = list(reference.targets_raw)
-        query = "SELECT frame, time_s, measured FROM frames WHERE recording = ? AND frame > ? ORDER BY frame"
-        frames = [_measurement(row, names) for row in self._db.execute(query, (recording, after))]
+        query = "SELECT frame, time_s, measured FROM frames WHERE recording = ?"
+        if only is not None:
+            query += " AND frame IN (SELECT value FROM json_each(?))"
+        chosen = () if only is None else (json.dumps(list(only)),)
+        rows = self._db.execute(f"{query} ORDER BY frame", (recording, *chosen))
+        frames = [_measurement(row, names) for row in rows]
         method = self._db.execute("SELECT method FROM recordings WHERE id = ?", (recording,)).fetchone()[0]
         stacked = {
             name: np.array([frame.targets_raw[name] for frame in frames]).reshape(

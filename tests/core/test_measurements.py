@@ -100,6 +100,8 @@ def test_frames_come_in_any_order_and_twice(tmp_path: Path) -> None:
             store.append(recording, measured(frame))
         assert store.measured_frames(recording) == [2, 7, 9]
         assert store.load(recording).frame.tolist() == [2, 7, 9]
+        assert store.load(recording, only=[9, 2, 40]).frame.tolist() == [2, 9]
+        assert store.load(recording, only=[]).frame.tolist() == []
 
 
 def test_a_new_recording_takes_the_place_of_its_method_only(tmp_path: Path) -> None:
