@@ -623,6 +623,11 @@ def test_what_is_missing_is_named_with_the_way_to_it(browser, project, server):
         expect(page.locator("#raster .hint")).to_have_text(
             "Give south, east and north too: until then, the extent stays as it was."
         )
+        # What is typed so far outlasts any other change.
+        page.get_by_label("Ground level in the cloud").fill("0.5")
+        page.keyboard.press("Enter")
+        expect(page.get_by_role("button", name="Undo")).to_be_enabled()
+        expect(page.get_by_label("west", exact=True)).to_have_value("-5.00")
         made = page.request.post(
             f"{address}/api/projects", data={"name": "bare"}, headers={"X-Rooftrack": "1", "Origin": address}
         ).json()["id"]

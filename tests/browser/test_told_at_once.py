@@ -181,5 +181,5 @@ def test_a_damaged_cloud_is_told_without_the_way_to_it(browser, project):
     with watched(browser, pages) as page:
         page.goto(f"{pages}/orthoimage?view=picture")
         words = page.locator("#ground .note")
-        expect(words).to_contain_text("cut.laz: is damaged")
+        expect(words).to_contain_text("cut.laz: ends before the table of its compressed chunks")
         expect(words).not_to_contain_text(str(folder))

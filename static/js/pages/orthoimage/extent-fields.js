@@ -12,12 +12,14 @@ const SIDES = ["west", "south", "east", "north"];
 export function extentFields(onChange) {
   /** @type {(number | null)[]} */
   let typed = [null, null, null, null];
+  /** @type {Extent | null} of the project, as last shown */
+  let shown = null;
+  const isPart = () => typed.includes(null) && typed.some((entry) => entry !== null);
   const missing = h("p", { class: "hint", role: "status" });
   const tellMissing = () => {
     const left = SIDES.filter((_, i) => typed[i] === null);
-    const partly = left.length > 0 && left.length < SIDES.length;
-    missing.hidden = !partly;
-    missing.textContent = partly ? `Give ${new Intl.ListFormat("en-GB").format(left)} too: until then, the extent stays as it was.` : "";
+    missing.hidden = !isPart();
+    missing.textContent = isPart() ? `Give ${new Intl.ListFormat("en-GB").format(left)} too: until then, the extent stays as it was.` : "";
   };
   const take = (/** @type {number} */ side, /** @type {number | null} */ value) => {
     typed = typed.with(side, value);
@@ -48,9 +50,11 @@ export function extentFields(onChange) {
       ),
       missing,
     ),
-    /** @param {Extent | null} extent @param {Extent | null} made of the orthoimage as it is */
+    /** Sides typed so far stay as long as the project's extent does. @param {Extent | null} extent @param {Extent | null} made of the orthoimage as it is */
     show(extent, made) {
-      typed = extent === null ? [null, null, null, null] : [...extent];
+      const isAsBefore = extent?.join() === shown?.join();
+      if (!isAsBefore || !isPart()) typed = extent === null ? [null, null, null, null] : [...extent];
+      shown = extent;
       tellMissing();
       fields.forEach((field, i) => {
         field.set(typed[i]);
