@@ -245,8 +245,8 @@ def _tile_corners(count: int) -> NDArray[np.int64]:
     """Return the mosaic coordinates (N, 2), as u, v, of the first pixel of each oversampled tile."""
     number, tile = np.arange(count), (2 * TILE_HALF_PX + 1) * OVERSAMPLING
     # Below one another, pixels of a tile lie together in memory.
-    columns = -(-count * tile // MOST_ROWS)
-    return np.stack([number % max(columns, 1), number // max(columns, 1)], axis=1) * tile
+    below = MOST_ROWS // tile
+    return np.stack([number // below, number % below], axis=1) * tile
 
 
 def _oversampled(tiles: NDArray[Any], corner: NDArray[np.int64]) -> Singles:

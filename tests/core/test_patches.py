@@ -169,3 +169,10 @@ def test_what_views_do_not_show_stays_as_the_reference_frame_shows_it() -> None:
     patches.denoise([views] * 8)
     found = patches.track(frame(TEXTURE(pixels(SIZE))), points(), still)
     assert np.abs(found.raw - points())[20:].max() < 0.02
+
+
+def test_more_patches_than_fit_below_one_another_are_found_too() -> None:
+    many = points(1489)
+    crowd = PatchTracker(frame(TEXTURE(pixels(SIZE))), many)
+    found = crowd.track(frame(TEXTURE(pixels(SIZE) - [0.3, 0.2])), many, np.broadcast_to(STILL, (1489, 2, 2)).copy())
+    assert np.abs(found.raw - many - [0.3, 0.2]).max() < 0.03
