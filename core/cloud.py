@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.coordinates import Floats, read_only
+from core.coordinates import LARGEST_M, Floats, read_only
 from core.errors import InputError
 from core.point_files import PointTable, read_pcd, read_ply, read_text
 from core.progress import Progress, silent
@@ -23,8 +23,6 @@ from core.progress import Progress, silent
 # Tables of numbers; the others say what they are in their first bytes.
 TABLE_SUFFIXES = (".xyz", ".pts", ".txt", ".csv", ".asc")
 CLOUD_SUFFIXES = (".las", ".laz", ".ply", ".pcd", ".e57", *TABLE_SUFFIXES)
-# No coordinate on Earth is larger, not even an easting with the number of its zone before it.
-_LARGEST_M = 1e8
 _LAS_CHUNK_POINTS = 2_000_000
 # ASPRS classes of points that are no surface: low noise and high noise.
 _NOISE_CLASSES = (7, 18)
@@ -141,7 +139,7 @@ def _eight_bits(rgb: NDArray[Any]) -> NDArray[np.uint8] | None:
 def _from_table(path: Path, table: PointTable) -> Cloud:
     if not len(table.xyz):
         raise InputError(f"{path}: holds no points; export it again.")
-    on_earth = (np.abs(table.xyz) < _LARGEST_M).all(axis=1)
+    on_earth = (np.abs(table.xyz) < LARGEST_M).all(axis=1)
     if not on_earth.all():
         raise InputError(
             f"{path}: {np.count_nonzero(~on_earth)} points have coordinates that are not finite or no place on Earth, "

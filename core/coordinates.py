@@ -24,6 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+# No coordinate on Earth is larger, not even an easting with the number of its zone before it.
+LARGEST_M = 1e8
+
 
 def read_only(array: ArrayLike) -> Floats:
     """Return a float64 copy that cannot be written to, for use inside frozen dataclasses."""

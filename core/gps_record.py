@@ -11,15 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from core.clock_times import EXAMPLES, ClockTime, finite, read_time, seconds
-from core.coordinates import Floats, read_only
+from core.coordinates import LARGEST_M, Floats, read_only
 from core.errors import InputError
 from core.project import GpsInput
 from core.text_files import decoded
 
 # Samples a record may lack: about six days at 10 Hz. Laid out evenly they take a gigabyte when they are correlated.
 _MOST_MISSING = 5_000_000
-# No coordinate on Earth is larger, not even an easting with the number of its zone before it.
-_LARGEST_M = 1e8
 _DECIMAL_COMMA = re.compile(r"([-+]?\d*),(\d+)")
 
 
@@ -206,7 +204,7 @@ def _row(lines: _Lines, number: int, text: str, *, places: list[int]) -> tuple[C
             position.append(finite(fields[place]))
         except ValueError:
             raise refusal(place, "a number") from None
-        if abs(position[-1]) > _LARGEST_M:
+        if abs(position[-1]) > LARGEST_M:
             raise refusal(place, "a coordinate in metres")
     return moment, (position[0], position[1])
 

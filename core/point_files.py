@@ -5,7 +5,6 @@ Whatever a file calls its columns, they arrive here as one table of named column
 
 from __future__ import annotations
 
-import codecs
 import itertools
 import os
 import re
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from core.coordinates import Floats
 from core.errors import InputError
 from core.progress import Progress
+from core.text_files import UTF_16_MARKS
 
 _TEXT_CHUNK_ROWS = 500_000
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf".decode("latin-1")
@@ -242,7 +242,7 @@ def _text_layout(path: Path) -> _TextLayout:
     names, count = list[str](), None
     with path.open("rb") as stream:
         for number, line in enumerate(stream):
-            if number == 0 and line.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            if number == 0 and line.startswith(UTF_16_MARKS):
                 raise InputError(f"{path}: is text in UTF-16; save it as UTF-8.")
             comma = _meaning_of_comma(path, number + 1, line)
             words = _words(line, comma)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import re
 
-_UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # Control characters but for those that divide lines, columns and pages, and the end mark of old programs.
 _NOT_TEXT = re.compile("[\0-\x08\x0e-\x19\x1b-\x1f]")
 
@@ -16,7 +16,7 @@ def decoded(content: bytes) -> str:
     Raises:
         ValueError: it holds no text.
     """
-    encoding = "utf-16" if content.startswith(_UTF_16_MARKS) else "utf-8-sig"
+    encoding = "utf-16" if content.startswith(UTF_16_MARKS) else "utf-8-sig"
     try:
         text = content.decode(encoding)
     except UnicodeDecodeError:
