@@ -64,6 +64,13 @@ def invert_homography(H: ArrayLike) -> Floats:
     return inverse / inverse[2, 2]
 
 
+def homography_jacobian(H: Floats, points: Floats) -> Floats:
+    """Return the derivatives (N, 2, 2) of `apply_homography(H, points)` by the points (N, 2)."""
+    mapped = points @ H[:, :2].T + H[:, 2]
+    xy = mapped[:, :2] / mapped[:, 2:]
+    return np.asarray((H[:2, :2] - xy[:, :, None] * H[2, :2]) / mapped[:, 2, None, None])
+
+
 def invert_2x2(matrices: Floats) -> Floats:
     """Return the inverses of matrices (..., 2, 2); of many small ones several times as quick as `np.linalg.inv`."""
     a, b, c, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 0], matrices[..., 1, 1]

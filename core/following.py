@@ -8,16 +8,17 @@ only has to be good to a few pixels, and the measurement then finds its own plac
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from core.apparent import Apparent
 from core.coordinates import Floats, apply_homography, finite_rows
 from core.errors import InputError
-from core.ground import ALIKE_SCORE, NOISY_ROUNDS, View, choose_features_within, homography_jacobian
+from core.ground import ALIKE_SCORE, NOISY_ROUNDS, View, choose_features_within
 from core.lens import Lens
 from core.motion import (
     LineSet,
@@ -28,10 +29,11 @@ from core.motion import (
     rigid_from_points,
     rigid_with_weights,
 )
-from core.patches import PatchTracker, Singles
+from core.patches import Singles
 from core.project import LINE_NAMES, Target
 from core.robust import finite_median
 from core.roof_lines import NOT_FOUND, STATIONS, LineMatch, LineTracker, find_strips
+from core.texture import Texture
 from core.video import Luma
 
 # Correlation of the whole target's picture below which it is not recognised.
@@ -53,40 +55,13 @@ TOO_LONG_STEP_M = 0.3
 AS_WELL = 0.8
 # Stations of a line that must be seen for it to count.
 LEAST_STATIONS = STATIONS // 4
+# Patches of a points target, and the fewest that make one.
 POINTS = 160
-
-
-@dataclass(frozen=True)
-class Apparent:
-    """Apparent rigid motion of a target in rays of the reference frame.
-
-    Attributes:
-        shift: (2,).
-        rotation_rad: about the target's middle.
-        step: of a prediction, how far the target has gone from the frame before the last to the last; else None.
-    """
-
-    shift: Floats
-    rotation_rad: float
-    step: float | None = None
-
-    @staticmethod
-    def none() -> Apparent:
-        """Return the state of rest."""
-        return Apparent(np.zeros(2), 0.0)
-
-    def towards(self, earlier: Apparent, factor: float) -> Apparent:
-        """Return the motion extrapolated from an earlier one by `factor` of the step between the two."""
-        return Apparent(
-            self.shift + factor * (self.shift - earlier.shift),
-            self.rotation_rad + factor * (self.rotation_rad - earlier.rotation_rad),
-            float(np.linalg.norm(self.shift - earlier.shift)),
-        )
-
-    def apply(self, points: Floats, centre: Floats) -> Floats:
-        """Return where points (..., 2) of the reference frame have moved."""
-        c, s = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
-        return np.asarray((points - centre) @ np.array([[c, s], [-s, c]]) + centre + self.shift)
+LEAST_POINTS = 6
+# Patches between the lines of a lines target, and the fewest that tell more than chance. More tell hardly more: what
+# compression gets wrong, it gets wrong for all of them alike.
+BETWEEN_LINES = 45
+LEAST_BETWEEN_LINES = 12
 
 
 @dataclass(frozen=True)
@@ -96,10 +71,12 @@ class TargetMatch:
     Attributes:
         raw: measured raw pixels: (L, STATIONS, 2, 2) edges of lines, or (N, 2) patches of points; nan where none.
         apparent: its motion, or None where it could not be determined.
+        texture_raw: (M, 2) patches between the lines, nan where not found; (0, 2) for points.
     """
 
     raw: Floats
     apparent: Apparent | None
+    texture_raw: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
     @property
     def measured(self) -> int:
@@ -108,9 +85,20 @@ class TargetMatch:
 
 
 class Follower(Protocol):
-    """Finds one target in a frame, given the camera."""
+    """Finds one target in a frame, given the camera.
+
+    Attributes:
+        reference_raw: what is looked for, as `TargetMatch.raw`, in the reference frame.
+        reference_texture_raw: likewise, as `TargetMatch.texture_raw`.
+        texture: the patches of either.
+    """
 
     reference_raw: Floats
+    reference_texture_raw: Floats
+    texture: Texture
+
+    def views(self, view: View) -> Singles:
+        """Return the patches as a view shows them; see `PatchTracker.views`."""
 
     def find(
         self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool, is_view: bool = False
@@ -166,7 +154,7 @@ def _scale(plan_m: Floats, to_ray0: Callable[[Floats], Floats], lens: Lens) -> S
 
 
 class LinesFollower:
-    """Follows L1, L2 and T1 of a target together.
+    """Follows L1, L2 and T1 of a target together, and patches of what lies between them.
 
     Args:
         luma: the reference frame, (height, width).
@@ -176,6 +164,8 @@ class LinesFollower:
 
     Attributes:
         reference_raw: (3, STATIONS, 2, 2) edges in the reference frame, raw pixels; nan where not found.
+        reference_texture_raw: (M, 2) patches between the lines, raw pixels; none where it is plain there.
+        texture: the same.
 
     Raises:
         InputError: a band leaves the frame or shows no line.
@@ -205,12 +195,26 @@ class LinesFollower:
         lines = [fit_line(points, np.ones(STATIONS), self._centre) for points in rays]
         self._lines = LineSet(np.array([n for n, _ in lines]), np.array([o for _, o in lines]), self._centre)
         self._whole = self._rigid(matches, np.eye(3)).normal[0]
+        self.reference_texture_raw = _between(luma, lens.raw_from_rays(ends.reshape(-1, 2)))
+        self.texture = Texture(luma, self.reference_texture_raw, lens, self._centre)
         self._finder = TargetFinder(luma, ends.reshape(-1, 2), lens, scale)
+
+    def views(self, view: View) -> Singles:
+        """Return the patches as a view shows them; see `PatchTracker.views`."""
+        seen = self._finder.search(view.luma, view.H_ray_ray0)
+        found = None if seen is None else self._measure(view.luma, view.H_ray_ray0, Apparent(seen, 0.0)).apparent
+        return self.texture.views(view.luma, view.H_ray_ray0, found)
 
     def find(
         self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool, is_view: bool = False
     ) -> TargetMatch:
-        """Return the lines in a frame; see `Follower.find`."""
+        """Return the lines in a frame and what lies between them; see `Follower.find`."""
+        lines = self._lines_in(luma, H_ray_ray0, predicted, confirm=confirm)
+        if lines.apparent is None:
+            return replace(lines, texture_raw=np.full_like(self.reference_texture_raw, np.nan))
+        return replace(lines, texture_raw=self.texture.find(luma, H_ray_ray0, lines.apparent, is_view=is_view))
+
+    def _lines_in(self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool) -> TargetMatch:
         found = self._measure(luma, H_ray_ray0, predicted) if predicted is not None else None
         confirm = confirm or (predicted is not None and self._may_mislead(predicted))
         if found is not None and self._may_be_kept(luma, H_ray_ray0, found.apparent, confirm):
@@ -254,6 +258,13 @@ class LinesFollower:
         return to_raw
 
 
+def _between(luma: Luma, ends_raw: Floats) -> Floats:
+    """Return patches (M, 2) of what lies between lines, given their ends (6, 2), raw pixels; none where it is plain."""
+    outline = cv2.convexHull(ends_raw.astype(np.float32))[:, 0]
+    points = choose_features_within(luma, np.asarray(outline, dtype=np.float64), BETWEEN_LINES)
+    return points if len(points) >= LEAST_BETWEEN_LINES else points[:0]
+
+
 def _middles_of_halves(midlines_raw: Floats) -> Floats:
     """Return the median points (L, 2, 2) of both halves of mid-lines (L, STATIONS, 2); nan of those hardly seen."""
     halves = midlines_raw.reshape(len(midlines_raw), 2, -1, 2).swapaxes(2, 3)
@@ -271,6 +282,8 @@ class PointsFollower:
 
     Attributes:
         reference_raw: (N, 2) centres of the patches in the reference frame, raw pixels.
+        reference_texture_raw: (0, 2), since there are no lines to lie between.
+        texture: the patches.
 
     Raises:
         InputError: the region shows too little texture.
@@ -278,12 +291,11 @@ class PointsFollower:
 
     def __init__(self, luma: Luma, region: Floats, lens: Lens, *, scale: Scale, name: str) -> None:
         self._lens = lens
-        points = choose_features_within(luma, lens.raw_from_rays(region), POINTS, name)
-        self.reference_raw = points
-        self.patches = PatchTracker(luma, points)
-        self._rays0 = lens.rays_from_raw(points)
-        self._J0_inverse = np.linalg.inv(lens.jacobian_raw_rays(self._rays0))
-        self._centre = self._rays0.mean(axis=0)
+        self.reference_raw = choose_features_within(luma, lens.raw_from_rays(region), POINTS)
+        if len(self.reference_raw) < LEAST_POINTS:
+            raise InputError(f"{name}.region_m shows too little texture to follow; enlarge it, or mark lines instead.")
+        self.reference_texture_raw = np.empty((0, 2))
+        self.texture = Texture(luma, self.reference_raw, lens)
         self._finder = TargetFinder(luma, region, lens, scale)
 
     def views(self, view: View) -> Singles:
@@ -293,10 +305,7 @@ class PointsFollower:
         if seen is not None:
             found = self._measure(view.luma, view.H_ray_ray0, Apparent(seen, 0.0), least_score=ALIKE_SCORE)
             found = self._settled(view.luma, view.H_ray_ray0, found, NOISY_ROUNDS, least_score=ALIKE_SCORE)
-        raw, ref_from_current = self._expected(view.H_ray_ray0, found.apparent or Apparent.none())
-        if found.apparent is None:
-            raw = np.full_like(raw, np.nan)
-        return self.patches.views(view.luma, raw, ref_from_current)
+        return self.texture.views(view.luma, view.H_ray_ray0, found.apparent)
 
     def find(
         self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool, is_view: bool = False
@@ -304,7 +313,7 @@ class PointsFollower:
         """Return the patches in a frame; see `Follower.find`."""
         found = self._measure(luma, H_ray_ray0, predicted, is_view=is_view) if predicted is not None else None
         if found is not None and found.apparent is not None:
-            rounds = NOISY_ROUNDS if self.patches.is_averaged else 0
+            rounds = NOISY_ROUNDS if self.texture.patches.is_averaged else 0
             return self._settled(luma, H_ray_ray0, found, rounds, is_view=is_view)
         seen = self._finder.search(luma, H_ray_ray0)
         if seen is None:
@@ -338,23 +347,12 @@ class PointsFollower:
         least_score: float | None = None,
         is_view: bool = False,
     ) -> TargetMatch:
-        matches = self.patches.track(luma, *self._expected(H_ray_ray0, predicted), is_view=is_view)
-        known = matches.score >= (least_score or self.patches.least_score)
-        raw = np.where(known[:, None], matches.raw, np.nan)
+        raw = self.texture.find(luma, H_ray_ray0, predicted, least_score=least_score, is_view=is_view)
         rays0 = apply_homography(np.linalg.inv(H_ray_ray0), self._lens.rays_from_raw(raw))
-        if finite_rows(raw).sum() < max(6, len(raw) // 4):
+        if finite_rows(raw).sum() < max(LEAST_POINTS, len(raw) // 4):
             return TargetMatch(np.full_like(raw, np.nan), None)
-        fit = rigid_from_points(rays0[None], np.ones((1, len(rays0))), self._rays0, self._centre)
+        fit = rigid_from_points(rays0[None], np.ones((1, len(rays0))), self.texture.rays0, self.texture.pivot)
         return TargetMatch(raw, _apparent_of(fit) if is_determined(fit.normal)[0] else None)
-
-    def _expected(self, H_ray_ray0: Floats, apparent: Apparent) -> tuple[Floats, Floats]:
-        """Return where the patches should be, (N, 2) raw pixels, and how they are deformed, as `PatchTracker.track`."""
-        moved = apparent.apply(self._rays0, self._centre)
-        rays = apply_homography(H_ray_ray0, moved)
-        c, s = np.cos(apparent.rotation_rad), np.sin(apparent.rotation_rad)
-        turn = np.array([[c, -s], [s, c]])
-        J = self._lens.jacobian_raw_rays(rays) @ homography_jacobian(H_ray_ray0, moved) @ turn @ self._J0_inverse
-        return self._lens.raw_from_rays(rays), np.linalg.inv(J)
 
 
 def _apparent_of(fit: RigidFit) -> Apparent:

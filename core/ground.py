@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.coordinates import Bools, Floats, apply_homography, finite_rows, invert_2x2
+from core.coordinates import Bools, Floats, apply_homography, finite_rows, homography_jacobian, invert_2x2
 from core.errors import InputError
 from core.lens import Lens
 from core.patches import HALF_PX, MARGIN_PX, Matches, PatchTracker, Singles
@@ -103,19 +103,12 @@ def choose_features(luma: Luma, moving_regions_px: Sequence[Sequence[tuple[float
     return points
 
 
-def choose_features_within(luma: Luma, region_raw: Floats, count: int, name: str) -> Floats:
-    """Return about `count` corners (N, 2) of the reference frame inside a polygon (M, 2), raw pixels.
-
-    Raises:
-        InputError: the region shows too little texture; `name` says which.
-    """
+def choose_features_within(luma: Luma, region_raw: Floats, count: int) -> Floats:
+    """Return about `count` corners (N, 2) of the reference frame inside a polygon (M, 2), raw pixels."""
     region: Luma = np.zeros(luma.shape, dtype=np.uint8)
     cv2.fillPoly(region, [np.rint(np.nan_to_num(region_raw, nan=-1e4)).astype(np.int32)], 1)
     inside = cv2.erode(region, np.ones((2 * HALF_PX + 1, 2 * HALF_PX + 1), np.uint8)).astype(bool)
-    points = _spread_corners(luma, inside & ground_mask(luma.shape, ()), count)
-    if len(points) < 6:
-        raise InputError(f"{name}.region_m shows too little texture to follow; enlarge it, or mark lines instead.")
-    return points
+    return _spread_corners(luma, inside & ground_mask(luma.shape, ()), count)
 
 
 def _spread_corners(luma: Luma, allowed: NDArray[np.bool_], count: int) -> Floats:
@@ -268,13 +261,6 @@ class GroundTracker:
         J[~usable] = J_raw_rays[~usable] = np.eye(2)
         raw = np.where(usable[:, None], self._lens.raw_from_rays(rays), np.nan)
         return ExpectedFeatures(rays, raw, J_raw_rays, invert_2x2(J))
-
-
-def homography_jacobian(H: Floats, points: Floats) -> Floats:
-    """Return the derivatives (N, 2, 2) of `apply_homography(H, points)` by the points (N, 2)."""
-    mapped = points @ H[:, :2].T + H[:, 2]
-    xy = mapped[:, :2] / mapped[:, 2:]
-    return np.asarray((H[:2, :2] - xy[:, :, None] * H[2, :2]) / mapped[:, 2, None, None])
 
 
 def fit_homography(source: Floats, target: Floats, *, tolerance: float) -> tuple[Floats | None, NDArray[np.bool_]]:

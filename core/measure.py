@@ -11,7 +11,7 @@ import itertools
 import math
 import pickle
 import threading
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Protocol
@@ -21,11 +21,11 @@ import cv2
 from core.chunks import HEAD_START, WARM_UP, Chunk, missing_chunks, processes_for
 from core.cluster import Cluster
 from core.errors import InputError
-from core.following import CONFIRM_EVERY, PointsFollower, make_follower
+from core.following import CONFIRM_EVERY, make_follower
 from core.ground import FEATURES, GroundTracker, View, choose_features, ground_mask
 from core.measurements import FrameMeasurement, MeasurementStore, Reference
 from core.parallel import available_cores
-from core.patches import PatchTracker, Singles
+from core.patches import Singles
 from core.prediction import MeasureSetup, nothing_measured, predict_apparent, predict_homography
 from core.progress import CancelToken, Progress, silent
 from core.video import Frame, FrameIndex, FramesAhead, Luma, frame_index, read_frames
@@ -90,15 +90,6 @@ def make_measurer(
         return measurer
 
 
-class Patched(Protocol):
-    """What is followed by patches of the reference frame."""
-
-    patches: PatchTracker
-
-    def views(self, view: View) -> Singles:
-        """Return the patches as a view shows them; see `PatchTracker.views`."""
-
-
 class GeometricMeasurer:
     """Patches on the ground, strips or patches on the targets; see `core.ground` and `core.following`.
 
@@ -120,8 +111,11 @@ class GeometricMeasurer:
         self._followers = {
             target.name: make_follower(luma, target, setup.rays_from_plan, setup.lens) for target in setup.targets
         }
-        targets_raw = {name: follower.reference_raw for name, follower in self._followers.items()}
-        self.reference = Reference(points, targets_raw)
+        self.reference = Reference(
+            points,
+            {name: follower.reference_raw for name, follower in self._followers.items()},
+            {name: follower.reference_texture_raw for name, follower in self._followers.items()},
+        )
         self._first = setup.reference_frame
         self._views = range(0)
 
@@ -132,13 +126,14 @@ class GeometricMeasurer:
 
     def denoise(self, following: Iterable[Luma]) -> None:
         """Average patches over the frames after the reference frame."""
-        points = [follower for follower in self._followers.values() if isinstance(follower, PointsFollower)]
-        patched: list[Patched] = [self._ground, *points]
-        seen = [[each.views(view) for each in patched] for view in self._ground.look_ahead(following)]
+        followers = [follower for follower in self._followers.values() if len(follower.texture)]
+        looking: list[Callable[[View], Singles]] = [self._ground.views, *(follower.views for follower in followers)]
+        seen = [[views(view) for views in looking] for view in self._ground.look_ahead(following)]
         if len(seen) < LEAST_VIEWS:
             return
-        for each, views in zip(patched, zip(*seen, strict=True), strict=True):
-            each.patches.denoise(views)
+        patches = [self._ground.patches, *(follower.texture.patches for follower in followers)]
+        for each, views in zip(patches, zip(*seen, strict=True), strict=True):
+            each.denoise(views)
         self._views = range(self._first, self._first + 1 + len(seen) // 2)
 
     def measure(self, luma: Luma, *, frame: int, time_s: float, before: Sequence[FrameMeasurement]) -> FrameMeasurement:
@@ -147,13 +142,15 @@ class GeometricMeasurer:
         ground = self._ground.find(luma, predict_homography(before, time_s), is_view=is_view)
         if ground is None:
             return nothing_measured(self.reference, frame, time_s)
-        targets_raw, apparent = {}, {}
+        targets_raw, texture_raw, apparent = {}, {}, {}
         for name, follower in self._followers.items():
             predicted = predict_apparent(before, name, time_s)
             confirm = frame % CONFIRM_EVERY == 0
             match = follower.find(luma, ground.H_ray_ray0, predicted, confirm=confirm, is_view=is_view)
-            targets_raw[name], apparent[name] = match.raw, match.apparent
-        return FrameMeasurement(frame, time_s, ground.H_ray_ray0, ground.matches.raw, targets_raw, apparent)
+            targets_raw[name], texture_raw[name], apparent[name] = match.raw, match.texture_raw, match.apparent
+        return FrameMeasurement(
+            frame, time_s, ground.H_ray_ray0, ground.matches.raw, targets_raw, apparent, texture_raw
+        )
 
 
 def measure_chunk(

@@ -12,15 +12,15 @@ import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from core.apparent import Apparent
 from core.coordinates import Floats
 from core.errors import InputError
-from core.following import Apparent
 
 # At most this much work is lost when the machine stops.
 COMMIT_EVERY_S = 0.8
@@ -41,10 +41,12 @@ class Reference:
     Attributes:
         ground_raw: (N, 2) ground features.
         targets_raw: per target, (L, S, 2, 2) edges of lines or (M, 2) patches of points.
+        texture_raw: per target, (M, 2) patches between its lines; none of a target that is not named.
     """
 
     ground_raw: Floats
     targets_raw: Mapping[str, Floats]
+    texture_raw: Mapping[str, Floats] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class FrameMeasurement:
     Attributes:
         H_ray_ray0: (3, 3) homography of the ground from the reference frame; nan where the ground was not recognised.
         ground_raw: (N, 2), nan where a feature was not found.
-        targets_raw: as in `Reference`, nan where not found.
+        targets_raw, texture_raw: as in `Reference`, nan where not found.
         apparent: each target's apparent motion, None where undetermined; a prediction, never a result.
     """
 
@@ -64,6 +66,7 @@ class FrameMeasurement:
     ground_raw: Floats
     targets_raw: Mapping[str, Floats]
     apparent: Mapping[str, Apparent | None]
+    texture_raw: Mapping[str, Floats] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,7 @@ class Recording:
     H_ray_ray0: Floats
     ground_raw: Floats
     targets_raw: Mapping[str, Floats]
+    texture_raw: Mapping[str, Floats] = field(default_factory=dict)
 
     def selected(self, chosen: NDArray[np.int64]) -> Recording:
         """Return some of the frames, by their place (M,) in these arrays."""
@@ -88,6 +92,7 @@ class Recording:
             H_ray_ray0=self.H_ray_ray0[chosen],
             ground_raw=self.ground_raw[chosen],
             targets_raw={name: raw[chosen] for name, raw in self.targets_raw.items()},
+            texture_raw={name: raw[chosen] for name, raw in self.texture_raw.items()},
         )
 
 
@@ -139,7 +144,7 @@ class MeasurementStore:
     def begin(self, method: str, fingerprint: str, reference: Reference) -> int:
         """Start a recording, taking the place of earlier ones of the same method; return its number."""
         names = list(reference.targets_raw)
-        arrays = [reference.ground_raw, *(reference.targets_raw[name] for name in names)]
+        arrays = [reference.ground_raw, *_by_target(names, reference)]
         with self._writing(), self._db:
             self._db.execute("DELETE FROM recordings WHERE method = ?", (method,))
             cursor = self._db.execute(
@@ -152,7 +157,7 @@ class MeasurementStore:
         """Add a frame; it is safe on disk within a second."""
         names = list(measured.targets_raw)
         states = [_state(measured.apparent[name]) for name in names]
-        arrays = [measured.ground_raw, *(measured.targets_raw[name] for name in names)]
+        arrays = [measured.ground_raw, *_by_target(names, measured)]
         blob = np.concatenate([measured.H_ray_ray0.ravel(), *states]).astype("<f8").tobytes() + _packed(arrays)
         with self._writing():
             self._db.execute(
@@ -187,8 +192,8 @@ class MeasurementStore:
         """Return what the recording looks for."""
         query = "SELECT targets, reference FROM recordings WHERE id = ?"
         names, blob = self._db.execute(query, (recording,)).fetchone()
-        ground, *targets = _unpacked(blob)
-        return Reference(ground, dict(zip(json.loads(names), targets, strict=True)))
+        ground, *by_target = _unpacked(blob)
+        return Reference(ground, *_named(json.loads(names), by_target))
 
     def frame(self, recording: int, frame: int) -> FrameMeasurement | None:
         """Return one frame, or None."""
@@ -207,22 +212,39 @@ class MeasurementStore:
         rows = self._db.execute(f"{query} ORDER BY frame", (recording, *chosen))
         frames = [_measurement(row, names) for row in rows]
         method = self._db.execute("SELECT method FROM recordings WHERE id = ?", (recording,)).fetchone()[0]
-        stacked = {
-            name: np.array([frame.targets_raw[name] for frame in frames]).reshape(
-                -1, *reference.targets_raw[name].shape
-            )
-            for name in names
-        }
+
+        def stacked(rows: list[Floats], like: Floats) -> Floats:
+            return np.array(rows).reshape(len(frames), *like.shape)
+
         return Recording(
             method=method,
             finished=self.is_finished(recording),
             reference=reference,
             frame=np.array([frame.frame for frame in frames], dtype=np.int64),
             time_s=np.array([frame.time_s for frame in frames]),
-            H_ray_ray0=np.array([frame.H_ray_ray0 for frame in frames]).reshape(-1, 3, 3),
-            ground_raw=np.array([frame.ground_raw for frame in frames]).reshape(-1, *reference.ground_raw.shape),
-            targets_raw=stacked,
+            H_ray_ray0=stacked([frame.H_ray_ray0 for frame in frames], np.eye(3)),
+            ground_raw=stacked([frame.ground_raw for frame in frames], reference.ground_raw),
+            targets_raw={
+                name: stacked([frame.targets_raw[name] for frame in frames], like)
+                for name, like in reference.targets_raw.items()
+            },
+            texture_raw={
+                name: stacked([frame.texture_raw[name] for frame in frames], like)
+                for name, like in reference.texture_raw.items()
+            },
         )
+
+
+def _by_target(names: Sequence[str], measured: Reference | FrameMeasurement) -> Iterator[Floats]:
+    """Yield what is measured of every target, and then what between its lines."""
+    yield from (measured.targets_raw[name] for name in names)
+    yield from (measured.texture_raw.get(name, np.empty((0, 2))) for name in names)
+
+
+def _named(names: Sequence[str], by_target: Sequence[Floats]) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """Return what `_by_target` yielded, under the names of the targets."""
+    targets, textures = by_target[: len(names)], by_target[len(names) :]
+    return dict(zip(names, targets, strict=True)), dict(zip(names, textures, strict=True))
 
 
 def _state(apparent: Apparent | None) -> Floats:
@@ -235,15 +257,14 @@ def _measurement(row: tuple[int, float, bytes], names: list[str]) -> FrameMeasur
     frame, time_s, blob = row
     count = 9 + 3 * len(names)
     head = np.frombuffer(blob, dtype="<f8", count=count)
-    ground, *targets = _unpacked(blob[8 * count :])
+    ground, *by_target = _unpacked(blob[8 * count :])
+    targets_raw, texture_raw = _named(names, by_target)
     states = head[9:].reshape(-1, 3)
     apparent = {
         name: Apparent(state[:2].copy(), float(state[2])) if np.isfinite(state).all() else None
         for name, state in zip(names, states, strict=True)
     }
-    return FrameMeasurement(
-        frame, time_s, head[:9].reshape(3, 3).copy(), ground, dict(zip(names, targets, strict=True)), apparent
-    )
+    return FrameMeasurement(frame, time_s, head[:9].reshape(3, 3).copy(), ground, targets_raw, apparent, texture_raw)
 
 
 def _packed(arrays: list[Floats]) -> bytes:

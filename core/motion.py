@@ -5,7 +5,7 @@ All functions work on many frames at once, and in any plane frame: rays while fo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,10 +63,14 @@ class RigidFit:
 
     def at(self, point: Floats, centre: Floats) -> Floats:
         """Return the displacement (F, 2) of a point (2,) of the body."""
-        arm = point - centre
-        c, s = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
-        turned = np.stack([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]], axis=-1)
-        return np.asarray(self.shift + turned - arm)
+        return np.asarray(self.carried(point[None], centre)[:, 0] - point)
+
+    def carried(self, points: Floats, centre: Floats) -> Floats:
+        """Return where points (N, 2) of the body are, (F, N, 2)."""
+        arm = points - centre
+        c, s = np.cos(self.rotation_rad)[:, None], np.sin(self.rotation_rad)[:, None]
+        turned = np.stack([c * arm[:, 0] - s * arm[:, 1], s * arm[:, 0] + c * arm[:, 1]], axis=-1)
+        return np.asarray(centre + self.shift[:, None] + turned)
 
 
 def fit_line(points: Floats, weight: Floats, centre: Floats) -> tuple[Floats, float]:
@@ -295,6 +299,19 @@ def _point_residual(x: Floats, shift: Floats, angle: Floats, r: Floats) -> tuple
     J[..., 0, 0] = J[..., 1, 1] = 1.0
     J[..., 0, 2], J[..., 1, 2] = -turned[..., 1], turned[..., 0]
     return x - turned - shift[:, None, :], J
+
+
+def combined_fit(fit: RigidFit, other: RigidFit, weight: Floats) -> RigidFit:
+    """Return the motion that two fits about the same centre tell together; residuals and weights of the first.
+
+    Args:
+        weight: (F,) of the other's information; 0 where it is not to count.
+    """
+    information = weight[:, None, None] * other.normal
+    beyond = np.column_stack([other.shift - fit.shift, other.rotation_rad - fit.rotation_rad])
+    normal = fit.normal + information
+    step = solve_damped(normal, (information @ beyond[..., None])[..., 0])
+    return replace(fit, shift=fit.shift + step[:, :2], rotation_rad=fit.rotation_rad + step[:, 2], normal=normal)
 
 
 def _median(values: Floats, axis: int) -> Floats:

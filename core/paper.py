@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from core.apparent import Apparent
 from core.coordinates import Floats, apply_homography, batches
 from core.errors import InputError
-from core.following import Apparent, Scale, TargetFinder
+from core.following import Scale, TargetFinder
 from core.ground import CameraFinder, fit_homography, ground_mask
 from core.lens import Lens
 from core.measurements import FrameMeasurement, Reference

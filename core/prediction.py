@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from core.apparent import Apparent
 from core.coordinates import Floats, apply_homography, invert_homography
 from core.errors import InputError
-from core.following import Apparent
 from core.lens import Lens
 from core.measurements import FrameMeasurement, Reference
 from core.project import Method, Project, Target
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from core.georeference import ReferenceFit
 
 # Raised whenever the same video would be measured differently: older recordings are then not continued.
-MEASURE_VERSION = 9
+MEASURE_VERSION = 10
 # Over a longer gap nothing goes on as it was, and the last place is as good a guess as any.
 MOST_STEPS = 2.0
 
@@ -93,6 +93,7 @@ def nothing_measured(reference: Reference, frame: int, time_s: float) -> FrameMe
         np.full_like(reference.ground_raw, np.nan),
         {name: np.full_like(raw, np.nan) for name, raw in reference.targets_raw.items()},
         dict.fromkeys(reference.targets_raw),
+        {name: np.full_like(raw, np.nan) for name, raw in reference.texture_raw.items()},
     )
 
 

@@ -80,6 +80,7 @@ def without_pictures(recording: Recording, gone: Bools) -> Recording:
         H_ray_ray0=blanked(recording.H_ray_ray0),
         ground_raw=blanked(recording.ground_raw),
         targets_raw={name: blanked(raw) for name, raw in recording.targets_raw.items()},
+        texture_raw={name: blanked(raw) for name, raw in recording.texture_raw.items()},
     )
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from core.apparent import Apparent
 from core.bodies import world_points
 from core.camera import Pose
 from core.coordinates import Floats, apply_homography, rotation_2d
 from core.export import fitted_lines
-from core.following import Apparent
 from core.georeference import ReferenceFit
 from core.measurements import FrameMeasurement, Recording
 from core.preview import band_outline

@@ -7,6 +7,7 @@ moves by itself, so its speed comes from its own track.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -78,9 +79,17 @@ def at_frame_times(recording: Recording, lens: Lens, readout_s: float, speed: Fl
     """
     if readout_s == 0.0:
         return recording
-    targets = {name: _unrolled(raw, recording.time_s, lens, readout_s) for name, raw in recording.targets_raw.items()}
+
+    def unrolled(by_target: Mapping[str, Floats]) -> dict[str, Floats]:
+        return {name: _unrolled(raw, recording.time_s, lens, readout_s) for name, raw in by_target.items()}
+
     ground = recording.ground_raw - readout_s * row_share(recording.ground_raw, lens)[..., None] * speed
-    return replace(recording, ground_raw=ground, targets_raw=targets)
+    return replace(
+        recording,
+        ground_raw=ground,
+        targets_raw=unrolled(recording.targets_raw),
+        texture_raw=unrolled(recording.texture_raw),
+    )
 
 
 def _unrolled(raw: Floats, time_s: Floats, lens: Lens, readout_s: float) -> Floats:

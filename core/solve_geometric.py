@@ -29,6 +29,7 @@ from core.roof_level import doubts, height_obstacle, refuse_if, scale_at_roof
 from core.row_times import Readout, at_frame_times, estimated_readout, ground_speed
 from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution, TargetSolution, frame_status
+from core.texture_motion import with_texture
 from core.uncertainty import GROUND_PART, LEAST_STILL, Sigma, combined_sigma, common_error, jitter, robust_jitter
 
 # Frames from which a rolling shutter is estimated.
@@ -184,7 +185,7 @@ def _readout(
     some = recording.selected(chosen)
     ground = solve_ground(some, start.lens, start.pose0, origin_m=reference.origin_m, relief=relief)
     poses = ground.known_poses
-    shifted = at_frame_times(replace(some, targets_raw={}), start.lens, READOUT_STEP_S, speed[chosen])
+    shifted = at_frame_times(replace(some, targets_raw={}, texture_raw={}), start.lens, READOUT_STEP_S, speed[chosen])
     rays = start.lens.rays_from_raw(shifted.ground_raw)
     moved = fit_poses(rays, poses.weight, ground.points_m, poses, iterations=3, robust=False)
     change = (moved.residual - poses.residual) / READOUT_STEP_S
@@ -231,21 +232,34 @@ def _solve_target(
     slow_m: Floats,
     origin_m: Floats,
 ) -> TargetSolution:
-    body, points = _on_plane(recording, target, used, ground, z_m=used.heights_m[target.name])
+    z_m = used.heights_m[target.name]
+    body, points = _on_plane(recording, target, used, ground, z_m=z_m)
     intervals = project.intervals_s
     still, after = (during(recording.time_s, part) for part in (intervals.pre_event, intervals.residual))
     fit = body.fit(points, still & ground.usable)
     used_points = (fit.weight > 0.1).reshape(len(fit.weight), -1).sum(axis=1)
-    status = frame_status(recording, project, ground, points_used=used_points, determined=body.is_determined(fit))
+    determined = body.is_determined(fit)
+    status = frame_status(recording, project, ground, points_used=used_points, determined=determined)
     is_measured = np.isin(status, MEASURED)
     at_rest = still & is_measured
-    moved = np.stack([fit.at(place, body.centre) for place in body.places], axis=1)
-    start_m, start_rad = (
-        (moved[at_rest].mean(axis=0), fit.rotation_rad[at_rest].mean()) if at_rest.any() else (np.zeros((2, 2)), 0.0)
+    whole = with_texture(
+        fit,
+        recording,
+        target.name,
+        body=body,
+        known=determined & ground.usable,
+        lens=used.lens,
+        pose0=used.pose0,
+        poses=ground.known_poses,
+        z_m=z_m,
     )
-    places, rotation = moved - start_m, fit.rotation_rad - start_rad
+    moved = np.stack([whole.at(place, body.centre) for place in body.places], axis=1)
+    start_m, start_rad = (
+        (moved[at_rest].mean(axis=0), whole.rotation_rad[at_rest].mean()) if at_rest.any() else (np.zeros((2, 2)), 0.0)
+    )
+    places, rotation = moved - start_m, whole.rotation_rad - start_rad
     sigma = combined_sigma(
-        _sigma_of_points(fit, body),
+        _sigma_of_points(whole, body),
         camera_m=_camera_part(target, used, ground, flight),
         shared_m=np.hypot(_ground_part(target, used, ground), common_error(fit.residual, recording.time_s, at_rest)),
         slow_m=slow_m,

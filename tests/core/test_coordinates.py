@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from core.coordinates import (
@@ -12,6 +12,7 @@ from core.coordinates import (
     batches,
     evenly_spread,
     finite_rows,
+    homography_jacobian,
     invert_2x2,
     invert_homography,
     read_only,
@@ -97,3 +98,14 @@ def test_an_orthoimage_is_north_up_and_counted_from_pixel_centres() -> None:
 def test_small_matrices_are_inverted_all_at_once() -> None:
     matrices = np.random.default_rng(2).normal(size=(5, 40, 2, 2))
     np.testing.assert_allclose(invert_2x2(matrices), np.linalg.inv(matrices), rtol=1e-9)
+
+
+@settings(max_examples=25)
+@given(st.lists(st.floats(-0.2, 0.2), min_size=8, max_size=8))
+def test_derivative_of_a_homography(entries: list[float]) -> None:
+    bent = np.eye(3) + np.append(entries, 0.0).reshape(3, 3)
+    points, step = np.random.default_rng(0).uniform(-0.6, 0.6, (10, 2)), 1e-6
+    J = homography_jacobian(bent, points)
+    for axis, unit in enumerate(np.eye(2) * step):
+        numerical = (apply_homography(bent, points + unit) - apply_homography(bent, points - unit)) / (2 * step)
+        np.testing.assert_allclose(J[:, :, axis], numerical, rtol=1e-6, atol=1e-6)

@@ -6,11 +6,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from core.apparent import Apparent
 from core.coordinates import Floats
 from core.errors import InputError
-from core.following import Apparent, LinesFollower, PointsFollower, Scale
+from core.following import LinesFollower, PointsFollower, Scale
 from core.ground import View
 from core.lens import Lens
+from core.patches import SETTLED_PX
 from core.video import Luma
 from tests.waves import frame, pixels, waves
 
@@ -95,10 +97,44 @@ def test_noisy_points_are_compared_with_a_mean_of_views() -> None:
     unaware = points.find(seen((3.4, -2.2)), np.eye(3), Apparent(np.array([3.0, -2.0]) / FOCAL_PX, 0.0), confirm=False)
     assert unaware.apparent is None
     shifts = np.random.default_rng(5).uniform(-6.0, 6.0, (16, 2))
-    points.patches.denoise([points.views(View(seen(tuple(shift)), np.eye(3), 0.4)) for shift in shifts])
+    points.texture.patches.denoise([points.views(View(seen(tuple(shift)), np.eye(3), 0.4)) for shift in shifts])
     found = points.find(seen((3.4, -2.2)), np.eye(3), Apparent(np.array([3.0, -2.0]) / FOCAL_PX, 0.0), confirm=False)
     np.testing.assert_allclose(shift_px(found.apparent), [3.4, -2.2], atol=0.1)
     assert np.isfinite(found.raw).all(axis=1).mean() > 0.8
+
+
+def test_a_region_without_texture_is_refused() -> None:
+    region = LENS.rays_from_raw(np.array([[120.0, 90.0], [360.0, 90.0], [360.0, 270.0], [120.0, 270.0]]))
+    scale = Scale(rays_per_m=PX_PER_M / FOCAL_PX, pixels_per_m=PX_PER_M)
+    with pytest.raises(InputError, match=r"targets\.roof\.region_m shows too little texture"):
+        PointsFollower(frame(np.full(SIZE[::-1], 128.0)), region, LENS, scale=scale, name="targets.roof")
+
+
+def test_what_lies_between_lines_is_found_where_they_are() -> None:
+    lines = follower()
+    within = lines.reference_texture_raw
+    assert len(within) >= 12
+    assert ((within >= BANDS.min(axis=(0, 1))) & (within <= BANDS.max(axis=(0, 1)))).all()
+    moved = np.roll(roof(), (3, -2), axis=(0, 1))
+    found = lines.find(moved, np.eye(3), Apparent(np.array([-1.0, 2.0]) / FOCAL_PX, 0.0), confirm=False)
+    np.testing.assert_allclose(found.texture_raw - within, np.broadcast_to([-2.0, 3.0], within.shape), atol=SETTLED_PX)
+
+
+def test_without_lines_nothing_is_looked_for_between_them() -> None:
+    plain = frame(np.full(SIZE[::-1], 110.0))
+    found = follower().find(plain, np.eye(3), Apparent.none(), confirm=False)
+    assert found.apparent is None
+    assert np.isnan(found.texture_raw).all()
+
+
+def test_between_lines_that_leave_little_room_nothing_is_followed() -> None:
+    ends = LENS.rays_from_raw(np.array([[[232, 150], [268, 150]], [[232, 180], [268, 180]], [[250, 146], [250, 184]]]))
+    scale = Scale(rays_per_m=PX_PER_M / FOCAL_PX, pixels_per_m=PX_PER_M)
+    lines = LinesFollower(roof(), ends, LENS, widths_px=[14.0] * 3, scale=scale, names=["L1", "L2", "T1"])
+    assert lines.reference_texture_raw.shape == (0, 2)
+    found = lines.find(np.roll(roof(), 2, axis=0), np.eye(3), Apparent.none(), confirm=False)
+    np.testing.assert_allclose(shift_px(found.apparent), [0.0, 2.0], atol=0.2)
+    assert found.texture_raw.shape == (0, 2)
 
 
 def test_lines_partly_hidden_or_mistaken_still_say_where_to_look_next() -> None:

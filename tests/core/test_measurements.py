@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from core.apparent import Apparent
 from core.errors import InputError
-from core.following import Apparent
 from core.measurements import FrameMeasurement, MeasurementStore, Reference
 
 # Raw pixels are kept to this part of a pixel.
@@ -22,6 +22,7 @@ def reference() -> Reference:
     return Reference(
         random.uniform(0, 3840, (30, 2)),
         {"roof": random.uniform(0, 3840, (3, 16, 2, 2)), "table": random.uniform(0, 3840, (12, 2))},
+        {"roof": random.uniform(0, 3840, (7, 2))},
     )
 
 
@@ -38,6 +39,7 @@ def measured(frame: int) -> FrameMeasurement:
         ground_raw=ground,
         targets_raw={"roof": roof, "table": random.uniform(0, 3840, (12, 2))},
         apparent={"roof": Apparent(random.normal(size=2), 0.01 * frame), "table": None},
+        texture_raw={"roof": random.uniform(0, 3840, (7, 2))},
     )
 
 
@@ -66,6 +68,10 @@ def test_what_goes_in_comes_out(tmp_path: Path) -> None:
         np.testing.assert_array_equal(loaded.H_ray_ray0[frame], measured(frame).H_ray_ray0)
         for name in ("roof", "table"):
             np.testing.assert_allclose(loaded.targets_raw[name][frame], measured(frame).targets_raw[name], atol=TICK_PX)
+        texture_raw = measured(frame).texture_raw["roof"]
+        np.testing.assert_allclose(loaded.texture_raw["roof"][frame], texture_raw, atol=TICK_PX)
+    np.testing.assert_allclose(loaded.reference.texture_raw["roof"], reference().texture_raw["roof"], atol=TICK_PX)
+    assert loaded.texture_raw["table"].shape == (5, 0, 2)
     assert one is not None
     apparent = one.apparent["roof"]
     assert apparent is not None

@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 from core.coordinates import Floats, rotation_2d
 from core.motion import (
     LineSet,
+    RigidFit,
+    combined_fit,
     fit_line,
     is_determined,
     is_determined_as_whole,
@@ -208,3 +210,40 @@ def test_a_glimpse_of_a_line_determines_nothing() -> None:
     normal = rigid_from_lines(points, np.ones(points.shape[:3]), lines()).normal
     assert is_determined(normal)[3]
     np.testing.assert_array_equal(is_determined_as_whole(normal, normal[0]), [True, True, True, False, True, True])
+
+
+# --- two fits --------------------------------------------------------------------------------------------------------
+
+
+def fit_of(x: float, y: float, rotation_rad: float, information: tuple[float, float, float]) -> RigidFit:
+    return RigidFit(
+        shift=np.array([[x, y]]),
+        rotation_rad=np.array([rotation_rad]),
+        residual=np.zeros((1, 3, 4)),
+        weight=np.ones((1, 3, 4)),
+        normal=np.diag(information)[None],
+        sigma=np.ones((1, 3)),
+    )
+
+
+def test_two_fits_are_weighed_by_what_they_know() -> None:
+    one, other = fit_of(0.0, 0.0, 0.0, (1.0, 4.0, 8.0)), fit_of(3.0, 3.0, 0.3, (2.0, 2.0, 4.0))
+    both = combined_fit(one, other, np.array([1.0]))
+    np.testing.assert_allclose(both.shift, [[2.0, 1.0]])
+    np.testing.assert_allclose(both.rotation_rad, [0.1])
+    np.testing.assert_allclose(both.normal, np.diag([3.0, 6.0, 12.0])[None])
+    np.testing.assert_allclose(combined_fit(one, other, np.array([0.5])).shift, [[1.5, 0.6]])
+    np.testing.assert_array_equal(combined_fit(one, other, np.array([0.0])).shift, one.shift)
+
+
+def test_what_one_fit_does_not_know_the_other_tells() -> None:
+    blind = fit_of(7.0, 1.0, 0.0, (0.0, 4.0, 8.0))
+    both = combined_fit(blind, fit_of(3.0, 1.0, 0.0, (2.0, 2.0, 4.0)), np.array([1.0]))
+    np.testing.assert_allclose(both.shift, [[3.0, 1.0]], atol=1e-6)
+
+
+def test_a_body_carries_its_points_along() -> None:
+    fit = fit_of(0.3, -0.2, 0.1, (1.0, 1.0, 1.0))
+    points = np.array([[1.0, 2.0], [-4.0, 0.5]])
+    np.testing.assert_allclose(fit.carried(points, CENTRE)[0], moved(points, np.array([0.3, -0.2]), 0.1))
+    np.testing.assert_allclose(fit.at(points[1], CENTRE), fit.carried(points, CENTRE)[:, 1] - points[1])

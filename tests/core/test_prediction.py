@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from core.apparent import Apparent
 from core.camera import exponential
 from core.coordinates import Floats
-from core.following import Apparent
 from core.measurements import FrameMeasurement
 from core.prediction import MOST_STEPS, predict_apparent, predict_homography
 

@@ -124,6 +124,20 @@ def test_frames_that_are_not_there_yet_are_no_repeats() -> None:
     assert not repeated_pictures(given.selected(np.arange(3))).any()
 
 
+def test_a_picture_that_is_gone_shows_nothing_at_all() -> None:
+    given = scene.recording()
+    given = replace(given, texture_raw={"roof": given.ground_raw[:, :20]})
+    gone = np.arange(scene.FRAMES) == 7
+    without = without_pictures(given, gone)
+    for values in (
+        without.H_ray_ray0,
+        without.ground_raw,
+        *without.targets_raw.values(),
+        *without.texture_raw.values(),
+    ):
+        np.testing.assert_array_equal(np.isnan(values).reshape(scene.FRAMES, -1).all(axis=1), gone)
+
+
 def test_lost_frames_are_no_repeats() -> None:
     given = scene.recording(NOISE_PX)
     gone = np.isin(np.arange(scene.FRAMES), [30, SHAKEN, SHAKEN + 1])

@@ -81,11 +81,13 @@ def test_a_rolling_shutter_is_taken_out_of_ground_and_targets() -> None:
     assert np.abs(seen - place - sway(TIME_S)[:, None]).max() > 0.15
     moment = TIME_S[:, None] + READOUT_S * row_share(seen, LENS)
     speed = np.stack([24.0 * np.cos(3.0 * moment), -10.0 * np.sin(2.0 * moment)], axis=-1)
-    held = at_frame_times(recording(ground=seen, target=seen), LENS, READOUT_S, speed)
+    rolling = replace(recording(ground=seen, target=seen), texture_raw={"roof": seen})
+    held = at_frame_times(rolling, LENS, READOUT_S, speed)
     true = place + sway(TIME_S)[:, None]
     # The second term of a Taylor series: a 100th of a second squared, half of 72 px/s².
     np.testing.assert_allclose(held.ground_raw, true, atol=0.005)
-    np.testing.assert_allclose(held.targets_raw["roof"][2:-2], true[2:-2], atol=0.01)
+    for raw in (held.targets_raw["roof"], held.texture_raw["roof"]):
+        np.testing.assert_allclose(raw[2:-2], true[2:-2], atol=0.01)
 
 
 def test_a_target_seen_in_a_few_frames_only_stays_where_it_was_seen() -> None:
