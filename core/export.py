@@ -277,6 +277,7 @@ def _target_summary(results: Results, target: Target, check: GpsCheck | None) ->
     return {
         **summarise(solution.histories[target.name], results.project.intervals_s),
         "height_m": solution.heights_m.get(target.name),
+        "texture_patches": int(solution.targets[target.name].texture_used.sum()),
         "relative_to": target.relative_to,
         "rest_m": dict(zip(("p1", "p2"), solution.targets[target.name].rest_m.tolist(), strict=True)),
         "gps": check.comparison.summary() if check is not None and check.target == target.name else None,
@@ -388,6 +389,8 @@ def _tracked_figure(results: Results, target: Target, luma: NDArray[np.uint8]) -
     else:
         lines, points = fitted_lines(measured, solution.lens)
         edges = {name: edge.reshape(-1, 2) for name, edge in zip(LINE_NAMES, measured, strict=True)}
+        between = reference.texture_raw.get(target.name, np.empty((0, 2)))
+        edges["between"] = between[solution.targets[target.name].texture_used]
     return figures.frame_figure(
         luma,
         lines_px=lines,

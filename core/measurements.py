@@ -83,6 +83,10 @@ class Recording:
     targets_raw: Mapping[str, Floats]
     texture_raw: Mapping[str, Floats] = field(default_factory=dict)
 
+    def texture_of(self, name: str) -> Floats:
+        """Return the patches between the lines of a target, (F, M, 2); none where none were looked for."""
+        return self.texture_raw.get(name, np.empty((len(self.frame), 0, 2)))
+
     def selected(self, chosen: NDArray[np.int64]) -> Recording:
         """Return some of the frames, by their place (M,) in these arrays."""
         return replace(

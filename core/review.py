@@ -10,7 +10,7 @@ import numpy as np
 from core.apparent import Apparent
 from core.bodies import world_points
 from core.camera import Pose
-from core.coordinates import Floats, apply_homography, rotation_2d
+from core.coordinates import Floats, apply_homography, finite_rows, rotation_2d
 from core.export import fitted_lines
 from core.georeference import ReferenceFit
 from core.measurements import FrameMeasurement, Recording
@@ -32,7 +32,8 @@ class TargetOverlay:
         edges_raw: by line, (N, 2) the edge points that were found.
         lines_raw: by line, (33, 2) the fitted mid-line.
         bands_raw: by line, (M, 2) outline of where it was looked for, moved along with the target.
-        points_raw: (N, 2) patches of a points target.
+        points_raw: (N, 2) patches of a points target, or those between lines that move with them.
+        points_rejected_raw: (N, 2) those that do not.
         p1_raw, p2_raw: (2,) where the lines cross; None where they do not.
     """
 
@@ -40,6 +41,7 @@ class TargetOverlay:
     lines_raw: Mapping[str, Floats]
     bands_raw: Mapping[str, Floats]
     points_raw: Floats
+    points_rejected_raw: Floats
     p1_raw: Floats | None
     p2_raw: Floats | None
 
@@ -115,8 +117,9 @@ def _target_overlay(
 ) -> TargetOverlay:
     raw = recording.targets_raw[target.name][place]
     if raw.ndim == 2:
-        seen = raw[np.isfinite(raw).all(axis=1)]
-        return TargetOverlay({}, {}, {}, seen, None, None)
+        return TargetOverlay({}, {}, {}, raw[finite_rows(raw)], np.empty((0, 2)), None, None)
+    texture = recording.texture_of(target.name)[place]
+    used = finite_rows(texture) & solution.targets[target.name].texture_used
     edges = dict(zip(LINE_NAMES, raw, strict=True))
     found = {name: edge[np.isfinite(edge).all(axis=(1, 2))] for name, edge in edges.items()}
     lines: dict[str, Floats] = {}
@@ -127,7 +130,8 @@ def _target_overlay(
         edges_raw={name: edge.reshape(-1, 2) for name, edge in found.items()},
         lines_raw=lines,
         bands_raw=_bands(solution.reference, target, measured),
-        points_raw=np.empty((0, 2)),
+        points_raw=texture[used],
+        points_rejected_raw=texture[finite_rows(texture) & ~used],
         p1_raw=crossings.get("P1"),
         p2_raw=crossings.get("P2"),
     )

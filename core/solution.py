@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,11 +63,13 @@ class TargetSolution:
         rest_m: (2, 2) P1 and P2 at rest, absolute world metres.
         growth: (F,) by what part of itself the target appears larger than at rest, nan where not measured; None for
             `paper`, whose scale follows what it sees.
+        texture_used: (M,) which patches between its lines move with them and took part.
     """
 
     history: TargetHistory
     rest_m: Floats
     growth: Floats | None = None
+    texture_used: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
 
 @dataclass(frozen=True)

@@ -242,7 +242,7 @@ def _solve_target(
     status = frame_status(recording, project, ground, points_used=used_points, determined=determined)
     is_measured = np.isin(status, MEASURED)
     at_rest = still & is_measured
-    whole = with_texture(
+    whole, texture_used = with_texture(
         fit,
         recording,
         target.name,
@@ -286,7 +286,7 @@ def _solve_target(
         rotation_raw_rad=raw_rad,
     )
     growth = np.where(np.isin(status, MEASURED), body.growth(fit), np.nan)
-    return TargetSolution(history=history, rest_m=body.places + start_m + origin_m, growth=growth)
+    return TargetSolution(history, body.places + start_m + origin_m, growth, texture_used)
 
 
 def _on_plane(

@@ -45,8 +45,8 @@ def with_texture(
     pose0: Pose,
     poses: PoseFit,
     z_m: float,
-) -> RigidFit:
-    """Return the motion of a target's lines and the texture between them together; the lines' where that is plain.
+) -> tuple[RigidFit, Bools]:
+    """Return the motion of a target's lines and the texture between them together, and which patches (N,) took part.
 
     Args:
         lines: motion of the lines alone.
@@ -56,9 +56,9 @@ def with_texture(
         lens, pose0, poses: of the recording, of the reference frame and of all frames.
         z_m: of the lines' plane.
     """
-    raw = recording.texture_raw.get(name, np.empty((len(known), 0, 2)))
+    raw = recording.texture_of(name)
     if raw.shape[1] < LEAST_PATCHES or not known.any():
-        return lines
+        return lines, np.zeros(raw.shape[1], dtype=np.bool_)
     rays = lens.rays_from_raw(np.where(known[:, None, None], raw, np.nan))
     patches = _Patches(rays, lens.rays_from_raw(recording.reference.texture_raw[name]), pose0, poses)
     z = np.full(raw.shape[1], z_m)
@@ -67,13 +67,13 @@ def with_texture(
     left = patches.left_over(z, lines, body.centre)
     belonging = _belonging(left, lines, known)
     if belonging.sum() < LEAST_PATCHES:
-        return lines
+        return lines, np.zeros_like(belonging)
     # What a patch leaves over in all frames alike is the noise with which the reference frame shows it.
     places = patches.places(z) - finite_median(np.moveaxis(left, 0, -1))
     texture = RestBody(None, patches.at_rest(z)[belonging], None, body.centre, body.places)
     motion = texture.fit(places[:, belonging], np.zeros(len(known), dtype=np.bool_))
     enough = (motion.weight > 0.1).sum(axis=1) >= LEAST_PATCHES
-    return combined_fit(lines, motion, np.where(enough, PLACES_PER_PATCH, 0.0))
+    return combined_fit(lines, motion, np.where(enough, PLACES_PER_PATCH, 0.0)), belonging
 
 
 @dataclass(frozen=True)

@@ -187,7 +187,10 @@ def _overlay(seen: FrameOverlay) -> dict[str, Any]:
             "bands_raw": {line: points(outline) for line, outline in target.bands_raw.items()},
             "edges_raw": {line: points(edges) for line, edges in target.edges_raw.items()},
             "lines_raw": {line: points(places) for line, places in target.lines_raw.items()},
-            "points_raw": {"used": points(target.points_raw), "rejected": []},
+            "points_raw": {
+                "used": points(target.points_raw),
+                "rejected": points(target.points_rejected_raw),
+            },
             "p1_raw": plain(target.p1_raw),
             "p2_raw": plain(target.p2_raw),
         }

@@ -95,6 +95,10 @@ def test_a_frame_is_shown_as_it_was_measured(tracked: TestClient) -> None:
     assert shift == pytest.approx([expected, 0.0], abs=0.1)
     band = np.array(moved["targets"]["roof"]["bands_raw"]["T1"]) - still["targets"]["roof"]["bands_raw"]["T1"]
     assert band.mean(axis=0) == pytest.approx([expected, 0.0], abs=0.3)
+    between = [np.array(review["targets"]["roof"]["points_raw"]["used"]) for review in (still, moved)]
+    counted = tracked.get(f"{CLIP}/files/summary.json").json()["targets"]["roof"]["texture_patches"]
+    assert len(between[0]) == len(between[1]) == counted > 10
+    assert (between[1] - between[0]).mean(axis=0) == pytest.approx([expected, 0.0], abs=0.1)
     answer = tracked.get(f"{CLIP}/review/{FRAMES}")
     assert (answer.status_code, answer.json()["error"]["kind"]) == (404, "missing")
 
