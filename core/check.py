@@ -42,7 +42,7 @@ from core.project import (
 from core.roof_level import height_obstacle, scale_obstacle
 from core.storage import File, file_at
 from core.text_files import decoded
-from core.video import FrameIndex, VideoInfo, frame_index, probe
+from core.video import FrameIndex, VideoInfo, frame_index, probe, video_warnings
 
 # Lines that cross at a smaller angle have an intersection that runs along both with every small error.
 MIN_CROSSING_RAD = np.radians(20.0)
@@ -86,6 +86,18 @@ def check_project(folder: Path, progress: Progress = silent, *, thorough: bool =
         setup = MeasureSetup.of(project, file_at(folder, project.inputs.video), inputs.reference)
         _tried(folder, problems, make_measurer, setup, None, inputs.index)
     return problems
+
+
+def check_warnings(folder: Path) -> list[str]:
+    """Return what keeps nothing from being measured but should be known before, one line each.
+
+    None of it is told of a project or a video that cannot be read: that is a problem.
+    """
+    try:
+        video = file_at(folder, read_project(folder).inputs.video)
+        return video_warnings(str(video), probe(video), float(frame_index(video).time_s[-1]))
+    except InputError:
+        return []
 
 
 def results_obstacle(folder: Path) -> str | None:
