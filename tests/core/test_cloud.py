@@ -171,6 +171,30 @@ def test_names_of_columns_may_stand_in_a_comment(tmp_path):
         assert len(read_cloud(tmp_path / "a.txt")) == 2
 
 
+@pytest.mark.parametrize(
+    "title",
+    [
+        "Site scan\n",
+        "Everything beside the laboratory, scanned\n",
+        "X Y Z Intensity R G B\n",
+        "x,y,z,intensity,red,green,blue\n",
+        "Points of the roof\nx y z intensity r g b\n",
+        "X [m]; Y [m]; Z [m]; Intensity; R; G; B\n",
+    ],
+)
+def test_a_first_line_without_numbers_is_a_title(tmp_path, title):
+    write_text(tmp_path / "a.xyz", title)
+    cloud = read_cloud(tmp_path / "a.xyz")
+    np.testing.assert_allclose(cloud.world_m, SAMPLE, atol=1e-6)
+    np.testing.assert_array_equal(cloud.colour, COLOURS)
+
+
+def test_a_title_names_columns_in_any_order(tmp_path):
+    for title, order in (("Northing(m),Easting(m),Elev(m)", "yxz"), ("Z Y X", "zyx"), ("I Z X Y", "izxy")):
+        write_text(tmp_path / "a.txt", title + "\n", order)
+        np.testing.assert_allclose(read_cloud(tmp_path / "a.txt").world_m, SAMPLE, atol=1e-6)
+
+
 def test_noise_is_left_out_and_said_so(tmp_path):
     write_las(tmp_path / "a.las", classification=np.where(np.arange(500) < 20, 7, 2).astype(np.uint8))
     cloud = read_cloud(tmp_path / "a.las")
@@ -254,6 +278,10 @@ REFUSED = [
     ("utf16.xyz", lambda file: file.write_text("1 2 3\n", encoding="utf-16"), "is text in UTF-16; save it as UTF-8"),
     ("word.xyz", with_word, "line 42 does not hold 3 numbers"),
     ("two.csv", lambda file: file.write_text("1,2\n3,4\n"), "line 1 is neither names of columns"),
+    ("north.csv", lambda file: file.write_text("Nord,Ost,Hoch\n1,2,3\n"), "line 1 has a word for each column but"),
+    ("titles.txt", lambda file: file.write_text("Site\nscan\n1 2 3\n"), "line 2 is neither names of columns"),
+    ("numbered.txt", lambda file: file.write_text("Scan 7\n1 2 3\n"), "line 1 is neither names of columns"),
+    ("words.txt", lambda file: file.write_text("no cloud at all\n"), "holds no points"),
     ("five.csv", lambda file: file.write_text("1,2,3,4,5\n"), "has 5 columns without names"),
     ("comma.xyz", lambda file: file.write_text("12,345, 6,789, 0,012\n"), "line 1 has decimal commas"),
     ("commas.txt", lambda file: file.write_text("x y z\n12,345, 6,789, 0\n"), "line 2 has decimal commas"),
