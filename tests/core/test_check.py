@@ -64,6 +64,11 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
         (put("gone.laz", "inputs", "cloud"), "gone.laz: not found"),
         (put(90, "reference_frame"), "reference_frame: is 90, but the video ends with frame 39"),
         (put("", "inputs", "cloud"), "inputs.cloud: names no file; give its path, or null"),
+        (put("", "inputs", "video"), "inputs.video: names no file; give its path."),
+        (
+            put("the roof", "targets", 0, "name"),
+            'targets[0].name: "the roof" cannot be the name of a file; take up to 64 letters',
+        ),
         (put("a\0b.csv", "inputs", "gps", "file"), "inputs.gps.file: names no file"),
         (put([[0, 20], [15, 39]], "excluded_frames"), "excluded_frames: leave no frame of the video"),
         (put([[30, 45]], "excluded_frames"), "excluded_frames[0]: [30, 45] ends after the last frame, 39"),
@@ -250,6 +255,14 @@ def test_what_lies_in_the_place_of_results_is_told_as_a_run_tells_it(tmp_path: P
     assert check_project(tmp_path) == [expected]
     with pytest.raises(OSError, match="File exists") as refusal:
         run_project(tmp_path)
+    assert disk_problem(refusal.value) == expected
+
+
+def test_of_a_path_that_a_file_cuts_off_the_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "results").write_text("somebody's notes")
+    with pytest.raises(NotADirectoryError) as refusal:
+        (tmp_path / "results" / "cache" / "cloud").mkdir(parents=True)
+    expected = f"{tmp_path / 'results'}: Not a directory; move away what lies in its place, then do it again."
     assert disk_problem(refusal.value) == expected
 
 
