@@ -192,6 +192,18 @@ def test_what_is_wrong_with_an_input_is_told_once_on_its_card(browser, project):
         expect(page.locator(".problems .note")).to_contain_text("Lens: missing")
 
 
+def test_a_project_that_cannot_be_opened_has_the_header_of_all_pages(browser, project):
+    folder, pages = project
+    targets = json.loads((folder / "project.json").read_text())["targets"]
+    change(folder, targets=[targets[0] | {"name": "the roof"}])
+    with watched(browser, pages, color_scheme="dark") as page:
+        page.goto(f"{pages}/regions")
+        expect(page.get_by_text('Target: "the roof" cannot be the name of a file')).to_be_visible()
+        expect(page.locator(".brand svg")).to_be_visible()
+        page.get_by_role("button", name="light").click()
+        expect(page.locator("html")).to_have_attribute("data-theme", "light")
+
+
 STAGE_SHOWN = """async (stage) => {
     const card = (await import("/static/js/components/job-card.js")).jobCard();
     card.show({ id: 1, kind: "cloud", state: "running", stage, message: "", done: 1, total: 2, rate_per_s: null });
