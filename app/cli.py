@@ -127,13 +127,15 @@ def _outcome(summary: Mapping[str, Any]) -> Iterator[str]:
 
 def _check(options: argparse.Namespace) -> int:
     folders = _project_folders(options.folders)
-    from core.check import check_project
+    from core.check import check_project, check_warnings
 
     with_problems = 0
     for folder in folders:
         problems = check_project(folder)
         for problem in problems:
             print(problem)
+        for warning in check_warnings(folder):
+            print(f"Warning: {warning}")
         if problems:
             with_problems += 1
         else:

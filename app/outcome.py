@@ -366,7 +366,7 @@ def _results_of(folder: ProjectFolder, project: Project, found: Solved) -> Resul
         solution=found.solution,
         gps=found.inputs.gps,
         video=found.inputs.video,
-        announced_s=found.inputs.info.duration_s,
+        info=found.inputs.info,
         sha256={},
         identity={},
         version=program_version(),

@@ -15,7 +15,7 @@ from app.frames import Fingerprint, fingerprint
 from app.reference import lens_of, outside_frame, reference_fit
 from app.store import ProjectFolder, problem_of, stored_inputs
 from app.videos import is_read_through, video_info
-from core.check import check_project
+from core.check import check_project, results_obstacle
 from core.errors import InputError
 from core.gps_record import GpsRecord, read_gps
 from core.project import GpsInput, Project, project_json
@@ -251,7 +251,8 @@ def _export(seen: _Look) -> Step:
 
 
 def _problems(folder: ProjectFolder, project: Project, look: bool) -> list[str] | None:
-    key = (str(folder.folder), project_json(project), outcome.input_stamps(folder, project))
+    no_place = results_obstacle(folder.folder)
+    key = (str(folder.folder), project_json(project), outcome.input_stamps(folder, project), no_place)
     if look and key not in _known_problems:
         place = f"{folder.folder}{os.sep}"
         found = [problem.replace(place, "") for problem in check_project(folder.folder, thorough=False)]

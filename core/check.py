@@ -5,7 +5,9 @@ Each problem is one line: the file, the place in it, what is wrong and what to d
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +18,7 @@ import numpy as np
 from core.cloud import Cloud, read_cloud
 from core.coordinates import Floats, is_in_frame
 from core.drift import corner_obstacle
-from core.errors import InputError
+from core.errors import InputError, disk_problem
 from core.georeference import ReferenceFit, fit_reference
 from core.gps_record import read_gps
 from core.ground_plane import fit_ground_plane
@@ -28,6 +30,7 @@ from core.progress import Progress, silent
 from core.project import (
     LINE_NAMES,
     PROJECT_FILE,
+    RESULTS_FOLDER,
     Band,
     Lines,
     Project,
@@ -39,7 +42,7 @@ from core.project import (
 from core.roof_level import height_obstacle, scale_obstacle
 from core.storage import File, file_at
 from core.text_files import decoded
-from core.video import FrameIndex, VideoInfo, frame_index, probe
+from core.video import FrameIndex, VideoInfo, frame_index, probe, video_warnings
 
 # Lines that cross at a smaller angle have an intersection that runs along both with every small error.
 MIN_CROSSING_RAD = np.radians(20.0)
@@ -73,6 +76,8 @@ def check_project(folder: Path, progress: Progress = silent, *, thorough: bool =
     except InputError as error:
         return _problems_of_file(file) or [str(error)]
     problems: list[str] = []
+    if no_place := results_obstacle(folder):
+        problems.append(no_place)
     inputs = _read_inputs(folder, project, problems, progress, thorough=thorough)
     problems += [f"{file}: {problem}." for problem in obstacles(project, inputs.index, inputs.reference)]
     for check in (_video_problems, _correspondence_problems, _region_problems, _target_problems, _time_problems):
@@ -81,6 +86,29 @@ def check_project(folder: Path, progress: Progress = silent, *, thorough: bool =
         setup = MeasureSetup.of(project, file_at(folder, project.inputs.video), inputs.reference)
         _tried(folder, problems, make_measurer, setup, None, inputs.index)
     return problems
+
+
+def check_warnings(folder: Path) -> list[str]:
+    """Return what keeps nothing from being measured but should be known before, one line each.
+
+    None of it is told of a project or a video that cannot be read: that is a problem.
+    """
+    try:
+        video = file_at(folder, read_project(folder).inputs.video)
+        return video_warnings(str(video), probe(video), float(frame_index(video).time_s[-1]))
+    except InputError:
+        return []
+
+
+def results_obstacle(folder: Path) -> str | None:
+    """Say what keeps results from being written into a project folder, in one sentence; None where nothing does."""
+    results = folder / RESULTS_FOLDER
+    code = None
+    if os.path.lexists(results) and not results.is_dir():
+        code = errno.EEXIST
+    elif not os.access(results if results.is_dir() else folder, os.W_OK | os.X_OK):
+        code = errno.EACCES
+    return None if code is None else disk_problem(OSError(code, os.strerror(code), str(results)))
 
 
 def obstacles(project: Project, index: FrameIndex | None, reference: ReferenceFit | None) -> Iterator[str]:

@@ -139,13 +139,17 @@ def _eight_bits(rgb: NDArray[Any]) -> NDArray[np.uint8] | None:
 def _from_table(path: Path, table: PointTable) -> Cloud:
     if not len(table.xyz):
         raise InputError(f"{path}: holds no points; export it again.")
-    on_earth = (np.abs(table.xyz) < LARGEST_M).all(axis=1)
+    _require_on_earth(path, table.xyz)
+    return _with_precision_note(path, table)
+
+
+def _require_on_earth(path: Path, world_m: Floats) -> None:
+    on_earth = (np.abs(world_m) < LARGEST_M).all(axis=1)
     if not on_earth.all():
         raise InputError(
             f"{path}: {np.count_nonzero(~on_earth)} points have coordinates that are not finite or no place on Earth, "
             f"the first is point {int(np.argmin(on_earth))} (counted from 0); remove them and export again."
         )
-    return _with_precision_note(path, table)
 
 
 def _with_precision_note(path: Path, table: PointTable) -> Cloud:
@@ -165,9 +169,10 @@ def _read_pcd(path: Path, progress: Progress) -> Cloud:
     if table is None:
         table = _read_compressed_pcd(path)
     # PCD marks rays without an echo by nan: they are no points.
-    finite = np.isfinite(table.xyz).all(axis=1)
+    finite = np.asarray(np.isfinite(table.xyz).all(axis=1))
     if not finite.any():
         raise InputError(f"{path}: holds no points; export it again.")
+    _require_on_earth(path, np.where(finite[:, None], table.xyz, 0))
     rgb = None if table.rgb is None else table.rgb[finite]
     intensity = None if table.intensity is None else table.intensity[finite]
     return _with_precision_note(path, PointTable(table.xyz[finite], rgb, intensity, table.stored_in_float32))
@@ -217,6 +222,7 @@ def _read_las(path: Path, progress: Progress) -> Cloud:
     dropped = found - len(whole["xyz"])
     notes = (f"{path}: {dropped} points classified as noise were left out.",) if dropped else ()
     world_m = whole["xyz"] * header.scales + header.offsets
+    _require_on_earth(path, world_m)
     return make_cloud(world_m, rgb=whole.get("rgb"), intensity=whole["intensity"], notes=notes)
 
 
@@ -282,7 +288,9 @@ def _read_e57(path: Path, progress: Progress) -> Cloud:
         file = pye57.E57(str(path))
         scans = []
         for number in range(file.scan_count):
-            scans.append(file.read_scan(number, intensity=True, colors=True, ignore_missing_fields=True))
+            # pye57 cannot read a scan without points, and leaves out those that a scan itself says are invalid.
+            if file.get_header(number).point_count:
+                scans.append(file.read_scan(number, intensity=True, colors=True, ignore_missing_fields=True))
             progress("cloud", number + 1, file.scan_count)
         file.close()
     except Exception as error:  # libE57 raises its own unnamed errors
@@ -291,9 +299,10 @@ def _read_e57(path: Path, progress: Progress) -> Cloud:
         raise InputError(f"{path}: holds no points; export it again.")
     world_m = _gathered(scans, ("cartesianX", "cartesianY", "cartesianZ"))
     assert world_m is not None
-    finite = np.isfinite(world_m).all(axis=1)
+    finite = np.asarray(np.isfinite(world_m).all(axis=1))
     if not finite.any():
         raise InputError(f"{path}: holds no points with finite coordinates; export it again.")
+    _require_on_earth(path, np.where(finite[:, None], world_m, 0))
     rgb, intensity = _gathered(scans, ("colorRed", "colorGreen", "colorBlue")), _gathered(scans, ("intensity",))
     return make_cloud(
         world_m[finite].astype(np.float64),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from pathlib import Path
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 OBSTRUCTED = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY)
@@ -23,6 +24,9 @@ class Cancelled(Exception):
 def disk_problem(error: OSError) -> str:
     """Return what kept a file from being written or read, in one sentence with its remedy."""
     file = error.filename2 or error.filename
+    if error.errno == errno.ENOTDIR and isinstance(file, str | os.PathLike):
+        # A file far up may stand in the way of a whole path.
+        file = next((parent for parent in Path(file).parents if parent.is_file()), file)
     where = f"{os.fsdecode(file)}: " if isinstance(file, str | bytes | os.PathLike) else ""
     if error.errno in DISK_FULL:
         remedy = "make room on the disk"

@@ -43,7 +43,7 @@ from core.solution import Ground, Solution
 from core.solve import filtered, unfiltered_history
 from core.storage import File, write_atomically
 from core.validation import GpsComparison, compare_with_gps
-from core.video import read_frame
+from core.video import VideoInfo, read_frame, video_warnings
 
 SUMMARY_FILE = "summary.json"
 FIGURES_FOLDER = "figures"
@@ -64,8 +64,6 @@ CAPTIONS = {
     "gps": "Displacement at the antenna, and GPS.",
     "camera": "Drift and turns of the camera from their means.",
 }
-# Containers round, count the sound, and add how long the last frame is shown; this is more than all of that.
-_MISSING_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ class Results:
         solution: displacement and everything it rests on.
         gps: to compare with, where given.
         video: its file.
-        announced_s: how long the video lasts by what its container says.
+        info: what its container says of it.
         sha256: of each input, by its path as the project names it.
         identity: of each input, by which it is told without reading all of it whether it is still the same.
         version: of the program.
@@ -93,7 +91,7 @@ class Results:
     solution: Solution
     gps: GpsRecord | None
     video: File
-    announced_s: float
+    info: VideoInfo
     sha256: Mapping[str, str]
     identity: Mapping[str, str]
     version: str
@@ -183,7 +181,8 @@ def compared_with_gps(results: Results) -> GpsCheck | None:
 
 def all_warnings(results: Results, check: GpsCheck | None) -> list[str]:
     """Return whatever an engineer must know before using the numbers, in sentences."""
-    warnings = [*_video_warnings(results), *results.solution.warnings]
+    last_s = float(results.recording.time_s[-1])
+    warnings = [*video_warnings(results.video.name, results.info, last_s), *results.solution.warnings]
     for target in results.project.targets:
         history = results.solution.histories[target.name]
         warnings += _measurement_warnings(history)
@@ -193,16 +192,6 @@ def all_warnings(results: Results, check: GpsCheck | None) -> list[str]:
     if check is not None:
         warnings += _gps_warnings(results.project, check)
     return warnings
-
-
-def _video_warnings(results: Results) -> list[str]:
-    last_s = float(results.recording.time_s[-1])
-    if results.announced_s - last_s < _MISSING_S:
-        return []
-    return [
-        f"{results.video.name}: says that it lasts {results.announced_s:.1f} s, but its frames end at {last_s:.1f} s, "
-        "as in a file that was cut off; copy it again."
-    ]
 
 
 def _measurement_warnings(history: TargetHistory) -> list[str]:

@@ -27,7 +27,7 @@ _BYTE_ORDER_MARK = b"\xef\xbb\xbf".decode("latin-1")
 _COLUMN_NAMES = {
     "x": ("x", "east", "easting", "east_m", "x_m", "//x"),
     "y": ("y", "north", "northing", "north_m", "y_m"),
-    "z": ("z", "height", "elevation", "up", "up_m", "z_m", "altitude"),
+    "z": ("z", "height", "elevation", "elev", "up", "up_m", "z_m", "altitude"),
     "intensity": ("intensity", "scalar_intensity", "i", "reflectance", "scalar_reflectance"),
     "red": ("red", "r", "diffuse_red"),
     "green": ("green", "g", "diffuse_green"),
@@ -40,6 +40,7 @@ _PLY_TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
+_UNIT = re.compile(rb"[\[(][^\])]*[\])]")
 _WITH_COMMAS = re.compile(rb"[-+]?\d+(?P<decimals>,\d+)?(?P<after>,?)")
 
 
@@ -195,7 +196,7 @@ def _unpacked_rgb(packed: NDArray[Any], kind: str) -> NDArray[np.uint8]:
 
 
 def read_text(path: Path, progress: Progress) -> PointTable:
-    """Read columns of numbers: XYZ, PTS, TXT or CSV, with or without a line of names.
+    """Read columns of numbers: XYZ, PTS, TXT or CSV, with or without a line of names, or a title without numbers.
 
     Without names the columns are x y z, then intensity (4 columns), red green blue (6), or intensity red green
     blue (7, as PTS has them). Numbers may have decimal commas where commas separate no columns.
@@ -239,7 +240,7 @@ class _TextLayout:
 
 def _text_layout(path: Path) -> _TextLayout:
     """Look at the first lines."""
-    names, count = list[str](), None
+    title, names, count = list[str](), list[str](), None
     with path.open("rb") as stream:
         for number, line in enumerate(stream):
             if number == 0 and line.startswith(UTF_16_MARKS):
@@ -248,14 +249,22 @@ def _text_layout(path: Path) -> _TextLayout:
             words = _words(line, comma)
             if number > 100:
                 break
-            if not words or (line.lstrip().startswith((b"#", b"//")) and not _as_names(words)):
+            named = _names_in(line)
+            if not words or (line.lstrip().startswith((b"#", b"//")) and not named):
                 continue
-            if _as_names(words):
-                bare = [word.lower().lstrip("#/") for word in words]
-                names = [_COLUMN_OF_NAME.get(name, name) for name in bare if name]
+            if named:
+                names = named
+            elif number == 0 and not any(_all_numbers([word]) for word in words):
+                title = words
             elif len(words) == 1 and words[0].isdigit():
                 count = int(words[0])
             elif len(words) >= 3 and _all_numbers(words):
+                if not names and len(title) == len(words):
+                    # Taken for x y z, columns of north, east and height would make a mirrored site.
+                    raise InputError(
+                        f"{path}: line 1 has a word for each column but does not name x, y and z; name them so, or "
+                        "put # before a line that is only a title."
+                    )
                 return _TextLayout(number, names or _names_by_number(path, stream, words, comma), count, comma)
             else:
                 raise InputError(
@@ -286,9 +295,11 @@ def _meaning_of_comma(path: Path, number: int, line: bytes) -> str:
     return "."
 
 
-def _as_names(words: list[str]) -> bool:
-    found = {_COLUMN_OF_NAME.get(word.lower().lstrip("#/")) for word in words}
-    return {"x", "y", "z"} <= found
+def _names_in(line: bytes) -> list[str]:
+    """Return what a line calls the columns, units in brackets aside; empty where it does not name x, y and z."""
+    bare = [word.lower().lstrip("#/") for word in _words(_UNIT.sub(b" ", line))]
+    names = [_COLUMN_OF_NAME.get(name, name) for name in bare if name]
+    return names if {"x", "y", "z"} <= set(names) else []
 
 
 def _all_numbers(words: list[str]) -> bool:

@@ -35,11 +35,19 @@ LINE_NAMES = ("L1", "L2", "T1")
 
 def _named(file: str) -> str:
     if not file or "\0" in file:
-        raise ValueError("names no file; give its path, or null where there is none")
+        raise ValueError("names no file; give its path")
     return file
 
 
+def _named_if_any(file: str | None) -> str | None:
+    try:
+        return None if file is None else _named(file)
+    except ValueError as error:
+        raise ValueError(f"{error}, or null where there is none") from None
+
+
 FileName = Annotated[str, AfterValidator(_named)]
+FileNameIfAny = Annotated[str | None, AfterValidator(_named_if_any)]
 
 
 class Model(BaseModel):
@@ -62,8 +70,8 @@ class Inputs(Model):
     """Files measured from; paths are relative to the project folder."""
 
     video: FileName
-    cloud: FileName | None = None
-    lens: FileName | None = None
+    cloud: FileNameIfAny = None
+    lens: FileNameIfAny = None
     gps: GpsInput | None = None
 
 
@@ -309,6 +317,11 @@ def _sentence(location: tuple[int | str, ...], kind: str, message: str, value: o
         return f'{path}: unknown key "{location[-1]}", remove it or correct its spelling'
     if kind == "missing":
         return f"{path}: missing, add it"
+    if kind == "string_pattern_mismatch":
+        return (
+            f"{path}: {_shortened(value)} cannot be the name of a file; take up to 64 letters from A to Z, digits, "
+            "- and _, a letter or digit first"
+        )
     message = message.removeprefix("Value error, ")
     if kind == "value_error":
         return f"{path}: {message}"

@@ -132,7 +132,7 @@ def run_project(
             solution=solution,
             gps=inputs.gps,
             video=inputs.video,
-            announced_s=inputs.info.duration_s,
+            info=inputs.info,
             sha256={name: sha256_of(file, folder / RESULTS_FOLDER) for name, file in files.items()},
             identity={name: content_identity(file) for name, file in files.items()},
             version=program_version(),

@@ -13,7 +13,7 @@ import sys
 import threading
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -51,6 +51,8 @@ PICTURE_BYTES = 1 << 20
 KEPT_BYTES = 1 << 24
 _M_MMAP_THRESHOLD = -3
 _M_TRIM_THRESHOLD = -1
+# Containers round, count the sound, and add how long the last frame is shown; this is more than all of that.
+_MISSING_S = 1.0
 EIGHT_BIT_LUMA = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 
 
@@ -61,6 +63,7 @@ class VideoInfo:
     Attributes:
         frames: as declared by the container; None where it does not say.
         rotation_deg: clockwise turn that was applied to make frames upright (0, 90, 180, 270).
+        is_interlaced: whether even and odd rows of a frame were filmed one after the other.
     """
 
     width: int
@@ -70,6 +73,7 @@ class VideoInfo:
     rate_hz: float
     codec: str
     rotation_deg: int
+    is_interlaced: bool
 
 
 @dataclass(frozen=True)
@@ -178,6 +182,8 @@ def probe(path: File) -> VideoInfo:
             rate_hz=rate_hz,
             codec=stream.codec_context.codec.canonical_name,
             rotation_deg=-frame.rotation % 360,
+            # Of what the stream says besides, not every codec fills in the order of fields.
+            is_interlaced=frame.interlaced_frame,
         )
 
 
@@ -185,6 +191,26 @@ def _duration_s(container: InputContainer, stream: VideoStream) -> float:
     if stream.duration is not None and stream.time_base is not None:
         return float(stream.duration * stream.time_base)
     return float(container.duration or 0) / av.time_base
+
+
+def video_warnings(name: str, info: VideoInfo, last_s: float | None) -> list[str]:
+    """Return what an engineer must know of a video that can be measured, in sentences that begin with its name.
+
+    Args:
+        last_s: time of the last frame, None where that is not known yet.
+    """
+    warnings = []
+    if info.is_interlaced:
+        warnings.append(
+            f"{name}: says that it is interlaced, so even and odd rows of a frame show two moments, and what moves is "
+            "measured between the two; film without interlacing, or deinterlace it, with FFmpeg's bwdif for instance."
+        )
+    if last_s is not None and info.duration_s - last_s >= _MISSING_S:
+        warnings.append(
+            f"{name}: says that it lasts {info.duration_s:.1f} s, but its frames end at {last_s:.1f} s, "
+            "as in a file that was cut off; copy it again."
+        )
+    return warnings
 
 
 def frame_index(path: File) -> FrameIndex:
@@ -272,7 +298,7 @@ class FramesAhead:
         self._ended = False
         self._stopped = threading.Event()
         threads = threads or min(MOST_THREADS, THREADS_PER_CORE * available_cores())
-        decoded = _decoded(path, index, start=start, stop=stop, threads=threads, options=AS_MEASURED)
+        decoded = _decoded(path, index, start=start, stop=stop, threads=threads)
         frames = (Frame(number, index.time_s_of(number), luma_of(picture)) for number, picture in decoded)
         self._thread = threading.Thread(target=self._decode, args=(frames,), name="video decoder", daemon=True)
         self._thread.start()
@@ -368,27 +394,10 @@ def read_frame(path: File, number: int, *, index: FrameIndex | None = None) -> F
     raise InputError(f"{path}: frame {number} cannot be decoded; choose another, or export the video again.")
 
 
-def read_frames_rgb(path: File, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Yield numbers and pictures of frames from `start` on, each (height, width, 3) RGB upright.
-
-    Raises:
-        InputError: as `read_frames`.
-    """
-    index = frame_index(path)
-    for number, picture in _decoded(path, index, start=start, stop=stop, threads=available_cores()):
-        yield number, np.ascontiguousarray(np.rot90(picture.to_ndarray(format="rgb24"), picture.rotation // 90))
-
-
 def _decoded(
-    path: File,
-    index: FrameIndex,
-    *,
-    start: int,
-    stop: int | None,
-    threads: int,
-    options: Mapping[str, str] | None = None,
+    path: File, index: FrameIndex, *, start: int, stop: int | None, threads: int
 ) -> Iterator[tuple[int, VideoFrame]]:
-    """Yield numbers and pictures of what can be decoded of frames `start` to `stop`; `options` are the decoder's.
+    """Yield numbers and pictures of what can be decoded of frames `start` to `stop`.
 
     A decoder tells of damage before it yields a key frame that it holds back; the number that is then missing tells of
     it once more.
@@ -401,7 +410,7 @@ def _decoded(
     with opened_video(path) as (container, stream):
         stream.codec_context.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
-        stream.codec_context.options = dict(options or {})
+        stream.codec_context.options = dict(AS_MEASURED)
         size = stream.width, stream.height
         if start > 0:
             _seek(container, stream, index, start)

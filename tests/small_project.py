@@ -30,15 +30,21 @@ def picture(size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
     return shown
 
 
-def write_video(file: Path, size: tuple[int, int] = SIZE, frames: int = FRAMES) -> None:
+def write_video(
+    file: Path, size: tuple[int, int] = SIZE, frames: int = FRAMES, options: dict[str, str] | None = None
+) -> None:
     shown = picture(size)
     with av.open(str(file), "w") as container:
-        stream = container.add_stream("libx264", rate=RATE_HZ)
+        stream = container.add_stream("libx264", rate=RATE_HZ, options=options)
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p"
         for _ in range(frames):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(shown, format="rgb24")))
         container.mux(stream.encode())
+
+
+def write_interlaced_video(file: Path) -> None:
+    write_video(file, options={"x264-params": "tff=1"})
 
 
 def write_inputs(folder: Path) -> None:

@@ -36,7 +36,7 @@ from core.gps_record import gps_columns, read_gps
 from core.lens import read_lens, require_image_size
 from core.project import Project
 from core.storage import File
-from core.video import frame_index
+from core.video import frame_index, video_warnings
 
 router = APIRouter(prefix="/api")
 
@@ -155,7 +155,7 @@ def _video(here: Context, folder: ProjectFolder, project: Project, video: File) 
     facts = {"width": info.width, "height": info.height, "codec": info.codec, "rotation_deg": info.rotation_deg}
     if not is_read_through(here.hub, folder, video):
         told = {"rate_hz": info.rate_hz, "frames": info.frames, "duration_s": info.duration_s}
-        return facts | told | {"variable_rate": None}
+        return facts | told | {"variable_rate": None, "warnings": video_warnings(video.name, info, None)}
     index = frame_index(video)
     steps_s = index.time_s[1:] - index.time_s[:-1]
     varies = len(steps_s) > 0 and bool(abs(steps_s - steps_s.mean()).max() > 0.1 * steps_s.mean())
@@ -164,6 +164,7 @@ def _video(here: Context, folder: ProjectFolder, project: Project, video: File) 
         "frames": len(index),
         "duration_s": float(index.time_s[-1]),
         "variable_rate": varies,
+        "warnings": video_warnings(video.name, info, float(index.time_s[-1])),
     }
 
 

@@ -217,6 +217,18 @@ def test_check_of_a_sound_project(inputs: Path, capsys: pytest.CaptureFixture[st
     assert "ready to run" in capsys.readouterr().out
 
 
+def test_check_warns_of_what_can_be_measured_all_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small_project.write_inputs(tmp_path)
+    small_project.write_document(tmp_path, small_project.document())
+    assert main(["check", str(tmp_path)]) == 0
+    assert "Warning" not in capsys.readouterr().out
+    small_project.write_interlaced_video(tmp_path / "video.mp4")
+    assert main(["check", str(tmp_path)]) == 0
+    warning, ready = capsys.readouterr().out.splitlines()
+    assert warning.startswith(f"Warning: {tmp_path / 'video.mp4'}: says that it is interlaced")
+    assert ready.endswith("ready to run.")
+
+
 def test_check_says_each_problem_in_a_line(inputs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     document = small_project.document()
     document["targets"] = []

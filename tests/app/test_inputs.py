@@ -22,6 +22,7 @@ from core.cloud import CLOUD_SUFFIXES
 from core.lens_calibration import IMAGE_SUFFIXES
 from core.video import frame_index
 from tests.app.conftest import ADDRESS, WRITE, TestClient
+from tests.small_project import write_interlaced_video
 
 SMALL = "/api/projects/small"
 
@@ -76,6 +77,13 @@ def test_a_gps_record_keeps_the_names_of_its_columns(client: TestClient, workspa
     send(client, "gps", "again.csv", (workspace / "small" / "gps.csv").read_bytes())
     gps = client.get(SMALL).json()["project"]["inputs"]["gps"]
     assert (gps["file"], gps["time"], gps["x"]) == ("again.csv", "time_s", "east_m")
+
+
+def test_what_to_know_of_a_video_stands_beside_what_was_understood_of_it(client: TestClient, workspace: Path) -> None:
+    assert client.get(f"{SMALL}/inputs").json()["video"]["warnings"] == []
+    write_interlaced_video(workspace / "small" / "video.mp4")
+    (warning,) = client.get(f"{SMALL}/inputs").json()["video"]["warnings"]
+    assert warning.startswith("video.mp4: says that it is interlaced")
 
 
 @pytest.mark.parametrize("name", ["../../evil.yaml", "a/b/evil.yaml", "..\\..\\evil.yaml", "C:\\evil.yaml"])

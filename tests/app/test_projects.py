@@ -282,6 +282,15 @@ def test_a_video_that_was_there_is_missed(client: TestClient, workspace: Path) -
     assert any("video.mp4" in problem for problem in state["problems"])
 
 
+def test_what_lies_in_the_place_of_results_is_told_until_it_is_gone(client: TestClient, workspace: Path) -> None:
+    assert get(client)["problems"] == []
+    (workspace / "small" / "results").write_text("somebody's notes")
+    (problem,) = get(client)["problems"]
+    assert problem.startswith("results: File exists; move away what lies in its place")
+    (workspace / "small" / "results").unlink()
+    assert get(client)["problems"] == []
+
+
 def test_a_project_that_cannot_be_made_leaves_nothing(client: TestClient, workspace: Path) -> None:
     answer = client.post("/api/projects", json={"name": "gone", "video": str(workspace / "none.mp4")})
     assert answer.status_code == 404

@@ -30,6 +30,7 @@ from tests.browser.steps import (
     tell_height,
     to_step,
 )
+from tests.small_project import write_interlaced_video
 
 WITHIN_PX = 0.5
 # A click falls on a whole CSS pixel, and the wheel has zoomed to six or more of them per pixel of the picture.
@@ -546,6 +547,28 @@ def test_a_problem_leads_to_the_step_where_it_is_put_right(browser, project):
         expect(problem).not_to_contain_text("project.json")
         problem.get_by_role("link", name="Regions").click()
         page.wait_for_url("**/regions")
+
+
+def test_what_to_know_of_a_file_stands_on_its_card(browser, project):
+    folder, pages = project
+    write_interlaced_video(folder / "fields.mp4")
+    far = np.array([500_000.0, 5_000_000.0, 100.0])
+    corners = np.array([[x, y, 0] for x in range(20) for y in range(20)])
+    rows = (far + corners).astype("<f4").tobytes()
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(corners)}\n"
+    properties = "".join(f"property float {axis}\n" for axis in "xyz")
+    (folder / "coarse.ply").write_bytes(f"{header}{properties}end_header\n".encode() + rows)
+    document = json.loads((folder / "project.json").read_text())
+    document["inputs"] = {"video": "fields.mp4", "cloud": "coarse.ply"}
+    (folder / "project.json").write_text(json.dumps(document))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/inputs")
+        warning = page.locator(".input-card[data-kind=video] .note.warn")
+        expect(warning).to_contain_text("fields.mp4: says that it is interlaced")
+        picture = page.get_by_alt_text("First frame").bounding_box()
+        assert warning.bounding_box()["y"] >= picture["y"] + picture["height"]
+        told = page.locator(".input-card[data-kind=cloud] .note.info")
+        expect(told).to_contain_text(re.compile("^coarse.ply: coordinates are stored in single precision"))
 
 
 def test_a_narrow_window_reads_downwards(browser, project):

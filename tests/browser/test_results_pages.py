@@ -396,6 +396,38 @@ def test_the_interval_of_rest_is_dragged_on_the_plot(browser, project):
         expect(field).to_have_attribute("aria-invalid", "true")
 
 
+@pytest.mark.parametrize(
+    ("towards_s", "event", "pulled"),
+    [
+        (4.0, (6.0, 15.0), {"pre_event": (0.0, 4.0)}),
+        (8.0, (6.0, 15.0), {"event": (8.0, 15.0)}),
+        (4.0, (6.0, 6.02), {"event": (4.0, 6.02)}),
+        (8.0, (6.0, 6.02), {"event": (6.0, 8.0)}),
+    ],
+    ids=["where two meet, left", "where two meet, right", "short, left", "short, right"],
+)
+def test_of_handles_in_one_place_that_one_is_pulled_which_has_room(browser, project, towards_s, event, pulled):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    before = {"pre_event": (0.0, 6.0 if event[1] > 7 else 1.0), "event": event, "residual": (17.0, 19.0)}
+    (folder / "project.json").write_text(json.dumps(document | {"intervals_s": before}))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/drift")
+        expect(page.get_by_role("slider")).to_have_count(7)  # six ends, and the corner frequency
+        area = page.locator(".drift-main .u-over").bounding_box()
+        x = lambda at_s: area["x"] + area["width"] * at_s / ((FRAMES - 1) / 30)  # noqa: E731
+        page.mouse.move(x(6.0), area["y"] + 60)
+        page.mouse.down()
+        page.mouse.move(x(towards_s), area["y"] + 60, steps=8)
+        page.mouse.up()
+        expected = {name: pytest.approx(interval, abs=0.03) for name, interval in (before | pulled).items()}
+        eventually(lambda: dict(read_project(folder).intervals_s) == expected)
+        (name,) = pulled
+        start_or_end = "Start" if before[name][0] != pulled[name][0] else "End"
+        slider = page.get_by_role("slider", name=f"{start_or_end} of {name.replace('_', '-')}")
+        expect(slider).to_be_focused()  # and the arrow keys move it on
+
+
 def test_table_2_says_what_the_summary_says(browser, headless, finished):
     gps = json.loads((headless / "results" / "summary.json").read_text())["targets"]["roof"]["gps"]
     with watched(browser, finished) as page:

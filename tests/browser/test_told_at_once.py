@@ -174,6 +174,55 @@ def test_in_a_narrow_window_two_wide_pictures_lie_one_above_the_other(browser, p
         assert alone["height"] == stage["height"]
 
 
+def test_what_is_wrong_with_an_input_is_told_once_on_its_card(browser, project):
+    folder, pages = project
+    (folder / "other.yaml").write_text((SAMPLE / "lens.yaml").read_text().replace("1280", "640"))
+    inputs = json.loads((folder / "project.json").read_text())["inputs"]
+    change(folder, inputs=inputs | {"lens": "other.yaml"})
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/inputs")
+        words = page.get_by_text("calibrate with the same video mode")
+        expect(words).to_have_count(1)
+        expect(
+            page.locator(".input-card[data-kind=lens]").get_by_text("calibrate with the same video mode")
+        ).to_be_visible()
+        expect(page.locator(".problems .note")).to_have_count(0)
+        change(folder, inputs=inputs | {"lens": None})  # what no card says stands above them
+        page.reload()
+        expect(page.locator(".problems .note")).to_contain_text("Lens: missing")
+
+
+def test_a_project_that_cannot_be_opened_has_the_header_of_all_pages(browser, project):
+    folder, pages = project
+    targets = json.loads((folder / "project.json").read_text())["targets"]
+    change(folder, targets=[targets[0] | {"name": "the roof"}])
+    with watched(browser, pages, color_scheme="dark") as page:
+        page.goto(f"{pages}/regions")
+        expect(page.get_by_text('Target: "the roof" cannot be the name of a file')).to_be_visible()
+        expect(page.locator(".brand svg")).to_be_visible()
+        page.get_by_role("button", name="light").click()
+        expect(page.locator("html")).to_have_attribute("data-theme", "light")
+
+
+STAGE_SHOWN = """async (stage) => {
+    const card = (await import("/static/js/components/job-card.js")).jobCard();
+    card.show({ id: 1, kind: "cloud", state: "running", stage, message: "", done: 1, total: 2, rate_per_s: null });
+    return card.element.textContent;
+}"""
+
+
+def test_a_stage_is_told_in_words_of_the_pages(browser, project):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/inputs")
+        for stage, words in {
+            "cloud": "Reading the cloud",
+            "calibration": "Looking at the pictures",
+            "": "Starting",
+        }.items():
+            assert page.evaluate(STAGE_SHOWN, stage).startswith(words)
+
+
 def test_a_damaged_cloud_is_told_without_the_way_to_it(browser, project):
     folder, pages = project
     (folder / "cut.laz").write_bytes((SAMPLE / "site.laz").read_bytes()[:1_000_000])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 
 from core.check import check_project
 from core.drift import corner_obstacle, high_pass
-from core.errors import InputError
+from core.errors import InputError, disk_problem
 from core.lens import Lens, write_lens
 from core.run import run_project
 from tests import small_project
@@ -63,6 +64,11 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
         (put("gone.laz", "inputs", "cloud"), "gone.laz: not found"),
         (put(90, "reference_frame"), "reference_frame: is 90, but the video ends with frame 39"),
         (put("", "inputs", "cloud"), "inputs.cloud: names no file; give its path, or null"),
+        (put("", "inputs", "video"), "inputs.video: names no file; give its path."),
+        (
+            put("the roof", "targets", 0, "name"),
+            'targets[0].name: "the roof" cannot be the name of a file; take up to 64 letters',
+        ),
         (put("a\0b.csv", "inputs", "gps", "file"), "inputs.gps.file: names no file"),
         (put([[0, 20], [15, 39]], "excluded_frames"), "excluded_frames: leave no frame of the video"),
         (put([[30, 45]], "excluded_frames"), "excluded_frames[0]: [30, 45] ends after the last frame, 39"),
@@ -239,6 +245,38 @@ def test_a_large_cloud_may_be_left_out(inputs: Path) -> None:
     document["inputs"]["cloud"] = "gone.laz"
     small_project.write_document(inputs, document)
     assert check_project(inputs, thorough=False) == []
+
+
+def test_what_lies_in_the_place_of_results_is_told_as_a_run_tells_it(tmp_path: Path) -> None:
+    small_project.write_inputs(tmp_path)
+    small_project.write_document(tmp_path, small_project.document())
+    (tmp_path / "results").write_text("somebody's notes")
+    expected = f"{tmp_path / 'results'}: File exists; move away what lies in its place, then do it again."
+    assert check_project(tmp_path) == [expected]
+    with pytest.raises(OSError, match="File exists") as refusal:
+        run_project(tmp_path)
+    assert disk_problem(refusal.value) == expected
+
+
+def test_of_a_path_that_a_file_cuts_off_the_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "results").write_text("somebody's notes")
+    with pytest.raises(NotADirectoryError) as refusal:
+        (tmp_path / "results" / "cache" / "cloud").mkdir(parents=True)
+    expected = f"{tmp_path / 'results'}: Not a directory; move away what lies in its place, then do it again."
+    assert disk_problem(refusal.value) == expected
+
+
+@pytest.mark.parametrize("made", [True, False], ids=["results", "folder"])
+def test_results_that_may_not_be_written_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: bool) -> None:
+    """The system's answer is put in its mouth: nothing is forbidden to those who test as root."""
+    small_project.write_inputs(tmp_path)
+    small_project.write_document(tmp_path, small_project.document())
+    if made:
+        (tmp_path / "results").mkdir()
+    forbidden = tmp_path / "results" if made else tmp_path
+    monkeypatch.setattr(os, "access", lambda place, mode: Path(place) != forbidden)
+    (line,) = check_project(tmp_path)
+    assert line == f"{tmp_path / 'results'}: Permission denied; make it accessible, then do it again."
 
 
 def test_nothing_is_written(inputs: Path) -> None:

@@ -89,6 +89,31 @@ def write_e57(file):
         e57.write_scan_raw({**table, "intensity": STRENGTH.astype(np.float64)})
 
 
+class Holed(np.ndarray):
+    """Coordinates whose bounds pye57 can write although some are no numbers, or there are none."""
+
+    def min(self):
+        return float(np.nan_to_num(np.asarray(self)).min(initial=0))
+
+    def max(self):
+        return float(np.nan_to_num(np.asarray(self)).max(initial=0))
+
+
+def write_scans(file, *scans, **more):
+    """Write an E57 file of bare scans, each (N, 3)."""
+    pye57 = pytest.importorskip("pye57")
+    with pye57.E57(str(file), mode="w") as e57:
+        for scan in scans:
+            e57.write_scan_raw({f"cartesian{axis}": scan[:, i].view(Holed) for i, axis in enumerate("XYZ")} | more)
+
+
+def holed(value):
+    """The sample about the origin, a few of its points with this coordinate."""
+    points = SAMPLE - ORIGIN
+    points[5:20, 1] = value
+    return points
+
+
 WRITERS = {
     "a.las": write_las,
     "a.laz": write_las,
@@ -171,11 +196,46 @@ def test_names_of_columns_may_stand_in_a_comment(tmp_path):
         assert len(read_cloud(tmp_path / "a.txt")) == 2
 
 
+@pytest.mark.parametrize(
+    "title",
+    [
+        "Site scan\n",
+        "Everything beside the laboratory, scanned\n",
+        "X Y Z Intensity R G B\n",
+        "x,y,z,intensity,red,green,blue\n",
+        "Points of the roof\nx y z intensity r g b\n",
+        "X [m]; Y [m]; Z [m]; Intensity; R; G; B\n",
+    ],
+)
+def test_a_first_line_without_numbers_is_a_title(tmp_path, title):
+    write_text(tmp_path / "a.xyz", title)
+    cloud = read_cloud(tmp_path / "a.xyz")
+    np.testing.assert_allclose(cloud.world_m, SAMPLE, atol=1e-6)
+    np.testing.assert_array_equal(cloud.colour, COLOURS)
+
+
+def test_a_title_names_columns_in_any_order(tmp_path):
+    for title, order in (("Northing(m),Easting(m),Elev(m)", "yxz"), ("Z Y X", "zyx"), ("I Z X Y", "izxy")):
+        write_text(tmp_path / "a.txt", title + "\n", order)
+        np.testing.assert_allclose(read_cloud(tmp_path / "a.txt").world_m, SAMPLE, atol=1e-6)
+
+
 def test_noise_is_left_out_and_said_so(tmp_path):
     write_las(tmp_path / "a.las", classification=np.where(np.arange(500) < 20, 7, 2).astype(np.uint8))
     cloud = read_cloud(tmp_path / "a.las")
     assert len(cloud) == 480
     assert "20 points classified as noise were left out" in cloud.notes[0]
+
+
+def test_points_of_e57_scans_that_are_none_are_left_out(tmp_path):
+    kept = np.delete(SAMPLE - ORIGIN, np.s_[5:20], axis=0)
+    write_scans(tmp_path / "nan.e57", holed(np.nan))
+    invalid = np.zeros(500, np.int8)
+    invalid[5:20] = 2
+    write_scans(tmp_path / "invalid.e57", holed(0.0), cartesianInvalidState=invalid)
+    write_scans(tmp_path / "empty.e57", np.empty((0, 3)), kept, np.empty((0, 3)))
+    for name in ("nan.e57", "invalid.e57", "empty.e57"):
+        np.testing.assert_allclose(read_cloud(tmp_path / name).world_m, kept, atol=1e-5)
 
 
 def test_colour_or_intensity_that_says_nothing_is_none(tmp_path):
@@ -251,9 +311,18 @@ REFUSED = [
     ("nopoints.csv", lambda file: file.write_text("x,y,z\n"), "holds no points"),
     ("nan.xyz", with_nan, r"1 points have coordinates that are not finite or .*, the first is point 41"),
     ("far.xyz", lambda file: file.write_text("1 2 3\n1e12 5 6\n"), r"no place on Earth, the first is point 1"),
+    ("far.e57", lambda file: write_scans(file, holed(1e30)), "15 points have .*, the first is point 5"),
+    ("nan.e57", lambda file: write_scans(file, np.full((9, 3), np.nan)), "no points with finite coordinates"),
+    ("none.e57", lambda file: write_scans(file, np.empty((0, 3))), "holds no points; export it again"),
+    ("far.las", changed("a.las", struct.pack("<d", 0.001), struct.pack("<d", 1e9)), "no place on Earth"),
+    ("far.pcd", changed("a.pcd", struct.pack("<d", SAMPLE[7, 0]), struct.pack("<d", 1e30)), "no place on Earth"),
     ("utf16.xyz", lambda file: file.write_text("1 2 3\n", encoding="utf-16"), "is text in UTF-16; save it as UTF-8"),
     ("word.xyz", with_word, "line 42 does not hold 3 numbers"),
     ("two.csv", lambda file: file.write_text("1,2\n3,4\n"), "line 1 is neither names of columns"),
+    ("north.csv", lambda file: file.write_text("Nord,Ost,Hoch\n1,2,3\n"), "line 1 has a word for each column but"),
+    ("titles.txt", lambda file: file.write_text("Site\nscan\n1 2 3\n"), "line 2 is neither names of columns"),
+    ("numbered.txt", lambda file: file.write_text("Scan 7\n1 2 3\n"), "line 1 is neither names of columns"),
+    ("words.txt", lambda file: file.write_text("no cloud at all\n"), "holds no points"),
     ("five.csv", lambda file: file.write_text("1,2,3,4,5\n"), "has 5 columns without names"),
     ("comma.xyz", lambda file: file.write_text("12,345, 6,789, 0,012\n"), "line 1 has decimal commas"),
     ("commas.txt", lambda file: file.write_text("x y z\n12,345, 6,789, 0\n"), "line 2 has decimal commas"),

@@ -22,6 +22,7 @@ from core.report import ReportFigure
 from core.results import read_history_csv
 from core.solution import Solution
 from core.solve import solve
+from core.video import probe
 from tests import exact_scene as scene
 from tests.small_project import write_video
 
@@ -58,7 +59,7 @@ def results(video: Path, project: Project, solution: Solution, **changes: Any) -
         solution=solution,
         gps=None,
         video=video,
-        announced_s=scene.FRAMES / scene.RATE_HZ,
+        info=probe(video),
         sha256={"video.mp4": "ab" * 32, "lens.yaml": "cd" * 32, "gps.csv": "ef" * 32},
         identity={"video.mp4": "12" * 32, "lens.yaml": "34" * 32, "gps.csv": "56" * 32},
         version="0.1.0",
@@ -321,10 +322,17 @@ def test_nothing_is_drawn_with_before_it_must_be() -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_video_that_ends_before_it_says_is_told(video: Path, tmp_path: Path) -> None:
-    made = results(video, scene.project_document(), solved(), announced_s=scene.FRAMES / scene.RATE_HZ + 2)
+    announced = replace(probe(video), duration_s=scene.FRAMES / scene.RATE_HZ + 2)
+    made = results(video, scene.project_document(), solved(), info=announced)
     warnings = write_results(tmp_path, made)["warnings"]
     assert warnings[0].startswith("video.mp4: says that it lasts")
     assert warnings[0].endswith("as in a file that was cut off; copy it again.")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_video_that_is_interlaced_is_told(video: Path, tmp_path: Path) -> None:
+    made = results(video, scene.project_document(), solved(), info=replace(probe(video), is_interlaced=True))
+    assert write_results(tmp_path, made)["warnings"][0].startswith("video.mp4: says that it is interlaced")
 
 
 @pytest.mark.usefixtures("undrawn")

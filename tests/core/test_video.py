@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from av.stream import Disposition
 from av.video.frame import PictureType
 
 from core.errors import InputError
-from core.video import FramesAhead, Luma, frame_index, luma_of, probe, read_frame, read_frames, read_frames_rgb
+from core.video import FramesAhead, Luma, frame_index, luma_of, probe, read_frame, read_frames, video_warnings
 from tests.packets import repacked
 
 SIZE = (96, 64)
@@ -150,11 +151,6 @@ def test_pictures_of_another_size_than_the_first_are_refused(tmp_path: Path, sta
 def test_single_frames(video: Path) -> None:
     for number in (0, 25, 49):
         assert number_of(read_frame(video, number).luma) == number
-        [(index, rgb)] = read_frames_rgb(video, number, number + 1)
-        assert index == number
-        assert rgb.shape == (64, 96, 3)
-        assert number_of(rgb[..., 1]) == number
-    assert [index for index, _ in read_frames_rgb(video, 20, 24)] == [20, 21, 22, 23]
 
 
 def test_uneven_timestamps_are_the_containers_own(tmp_path: Path) -> None:
@@ -175,11 +171,46 @@ def test_turned_frames_are_made_upright(tmp_path: Path, rotation: int, corner: t
     info = probe(file)
     assert info.rotation_deg == rotation
     assert (info.width, info.height) == ((96, 64) if rotation == 180 else (64, 96))
-    luma, [(_, rgb)] = read_frame(file, 1).luma, list(read_frames_rgb(file, 1, 2))
-    assert luma.shape == rgb.shape[:2] == (info.height, info.width)
+    luma = read_frame(file, 1).luma
+    assert luma.shape == (info.height, info.width)
     # The bright corner was at the top left; it turns clockwise with the picture.
     assert luma[corner] > 200
-    assert rgb[(*corner, 1)] > 200
+
+
+# --- what is said of a video before it is measured -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pix_fmt", "options"),
+    [
+        ("fields.mp4", "libx264", "yuv420p", {"x264-params": "tff=1"}),
+        ("fields.mkv", "libx264", "yuv420p", {"x264-params": "bff=1"}),
+        ("fields.mp4", "libx265", "yuv420p", {"x265-params": "interlace=tff"}),
+        ("fields.mov", "prores_ks", "yuv422p10le", {"flags": "+ildct", "bf": "0"}),
+    ],
+)
+def test_interlaced_footage_is_told(
+    tmp_path: Path, name: str, codec: str, pix_fmt: str, options: dict[str, str]
+) -> None:
+    info = probe(write(tmp_path / name, frames=12, codec=codec, pix_fmt=pix_fmt, options=options))
+    (warning,) = video_warnings(name, info, info.duration_s)
+    assert warning.startswith(f"{name}: says that it is interlaced")
+    assert warning.endswith("or deinterlace it, with FFmpeg's bwdif for instance.")
+
+
+@pytest.mark.parametrize(
+    ("codec", "pix_fmt"), [("libx264", "yuv420p"), ("libx265", "yuv420p"), ("prores_ks", "yuv422p10le")]
+)
+def test_of_progressive_footage_there_is_nothing_to_tell(tmp_path: Path, codec: str, pix_fmt: str) -> None:
+    info = probe(write(tmp_path / "frames.mkv", frames=12, codec=codec, pix_fmt=pix_fmt, options={"bf": "0"}))
+    assert video_warnings("frames.mkv", info, info.duration_s) == []
+
+
+def test_frames_that_end_before_the_container_says_are_told(video: Path) -> None:
+    info = replace(probe(video), duration_s=4.0)
+    (warning,) = video_warnings("video.mp4", info, 1.96)
+    assert warning.startswith("video.mp4: says that it lasts 4.0 s, but its frames end at 2.0 s")
+    assert video_warnings("video.mp4", info, None) == []
 
 
 # --- other pictures --------------------------------------------------------------------------------------------------
@@ -316,8 +347,6 @@ def test_frames_beyond_the_end(video: Path) -> None:
         list(read_frames(video, FRAMES))
     with pytest.raises(InputError, match="there is no frame 70"):
         read_frame(video, 70)
-    with pytest.raises(InputError, match="there is no frame 70"):
-        list(read_frames_rgb(video, 70))
 
 
 @pytest.mark.parametrize("codec", ["libx264", "libx265"])

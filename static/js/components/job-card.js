@@ -9,6 +9,19 @@ import { toastError } from "./toast.js";
 
 /** @typedef {import("../lib/types.js").Job} Job */
 
+/** What the engine calls its stages, in words of the pages. @type {Record<string, string>} */
+const STAGES = {
+  cloud: "Reading the cloud",
+  measuring: "Measuring frames",
+  solving: "Solving",
+  orthoimage: "Making the orthoimage",
+  "drawing figures": "Drawing figures",
+  calibration: "Looking at the pictures",
+};
+
+/** What a running job is doing. @param {Job} job */
+export const stageWords = (job) => STAGES[job.stage] ?? (job.stage || "Starting");
+
 /** Whether a job still works. @param {Job | null} job */
 export const isRunning = (job) => job !== null && job.state === "running";
 
@@ -39,7 +52,7 @@ export function jobCard({ unit = "" } = {}) {
       element.classList.toggle("failed", failed);
       cancel.hidden = !isRunning(job);
       bar.hidden = failed;
-      stage.textContent = failed ? told(job.message || "Failed").words : job.stage || "Starting";
+      stage.textContent = failed ? told(job.message || "Failed").words : stageWords(job);
       numbers.textContent = isRunning(job) ? progressWords(job, unit) : "";
       if (job.total > 0) bar.value = job.done / job.total;
       else bar.removeAttribute("value");

@@ -20,7 +20,7 @@ import { bindKeys } from "../lib/keys.js";
 import { fill, find, h } from "../lib/dom.js";
 import { isConflict, sentence } from "../lib/api.js";
 import { plural } from "../lib/format.js";
-import { projectHeader, STEPS, tellConnection } from "./header.js";
+import { projectHeader, projectsHeader, STEPS, tellConnection } from "./header.js";
 import { toast, toastError } from "./toast.js";
 
 /** @typedef {import("../lib/types.js").StepName} StepName */
@@ -95,7 +95,7 @@ const whyLost = (error) =>
 
 /** @param {string} message */
 function showDeadEnd(message) {
-  fill(find("#header"), h("a", { class: "brand", href: "/" }, "Rooftrack"));
+  projectsHeader();
   const box = h(
     "div",
     { class: "empty-state" },

@@ -8,6 +8,10 @@ import { decorate, h } from "../lib/dom.js";
 /** @type {Record<string, string>} */
 const STATUS_COLOURS = { weak: "--warn", lost: "--bad", excluded: "--text-faint" };
 const STRIP_PX = 6;
+/** Handles whose distances from the pointer differ by less are pointed at alike. */
+const ALIKE_PX = 3;
+/** How far the pointer moves before it is told which way it goes. */
+const TURNED_PX = 3;
 
 /**
  * Fill the intervals behind the curves.
@@ -170,13 +174,19 @@ function hatch(g, { from, wide, top, height, colour }) {
   g.restore();
 }
 
-/** The ends of editable intervals as sliders: dragged by the pointer, moved by the arrow keys. */
+/** @typedef {{key: string, end: "from"|"to", handle: HTMLElement}} End of an interval */
+
+/**
+ * The ends of editable intervals as sliders: dragged by the pointer, moved by the arrow keys.
+ * Where several lie in one place, the pointer takes that one for which there is room where it goes.
+ */
 export class IntervalHandles {
   /** @param {Plot} plot */
   constructor(plot) {
     this.plot = plot;
     this.layer = h("div", { class: "plot-handles" });
-    /** @type {Map<string, HTMLElement>} */ this.handles = new Map();
+    /** @type {Map<string, End>} */ this.handles = new Map();
+    /** What the pointer may have hold of, and since where. @type {{ends: End[], px: number} | null} */ this.held = null;
   }
 
   place() {
@@ -188,7 +198,7 @@ export class IntervalHandles {
         this.placeOne(interval, end);
       }
     }
-    for (const [name, handle] of this.handles) {
+    for (const [name, { handle }] of this.handles) {
       if (wanted.has(name)) continue;
       handle.remove();
       this.handles.delete(name);
@@ -198,8 +208,7 @@ export class IntervalHandles {
   /** @param {Interval} interval @param {"from"|"to"} end */
   placeOne(interval, end) {
     const name = `${interval.key}/${end}`;
-    const handle = this.handles.get(name) ?? this.make(interval.key, end);
-    this.handles.set(name, handle);
+    const { handle } = this.handles.get(name) ?? this.make(interval.key, end);
     const [min, max] = this.plot.extent;
     handle.hidden = interval[end] < min || interval[end] > max;
     handle.style.transform = `translateX(${this.plot.u.valToPos(interval[end], "x")}px)`;
@@ -214,32 +223,55 @@ export class IntervalHandles {
     });
   }
 
-  /** @param {string} key @param {"from"|"to"} end @returns {HTMLElement} */
+  /** @param {string} key @param {"from"|"to"} end @returns {End} */
   make(key, end) {
     const handle = h("div", { class: "plot-handle", tabindex: 0, role: "slider", "data-end": end });
     handle.addEventListener("pointerdown", (event) => {
       event.stopPropagation();
       event.preventDefault();
-      handle.focus();
       handle.setPointerCapture(event.pointerId);
+      this.held = { ends: this.endsAt(event.clientX), px: event.clientX };
+      this.held.ends[0]?.handle.focus();
     });
     handle.addEventListener("pointermove", (event) => {
       if (!handle.hasPointerCapture(event.pointerId)) return;
       event.stopPropagation();
-      this.move(
-        key,
-        end,
-        this.plot.u.posToVal(event.clientX - this.plot.u.over.getBoundingClientRect().left, "x"),
-        false,
-      );
+      const taken = this.takenBy(event.clientX);
+      const x = this.plot.u.posToVal(event.clientX - this.plot.u.over.getBoundingClientRect().left, "x");
+      if (taken) this.move(taken.key, taken.end, x, false);
     });
     handle.addEventListener("pointerup", (event) => {
       event.stopPropagation();
-      this.move(key, end, this.value(key, end), true);
+      const taken = this.takenBy(event.clientX);
+      if (taken) this.move(taken.key, taken.end, this.value(taken.key, taken.end), true);
+      this.held = null;
     });
     handle.addEventListener("keydown", (event) => this.key(event, key, end));
     this.layer.append(handle);
-    return handle;
+    const made = { key, end, handle };
+    this.handles.set(`${key}/${end}`, made);
+    return made;
+  }
+
+  /** What lies under a pointer, the nearest first; what is clearly farther than that is left out. @param {number} px CSS px of the window @returns {End[]} */
+  endsAt(px) {
+    const found = [...this.handles.values()]
+      .map((end) => ({ end, box: end.handle.getBoundingClientRect() }))
+      .filter(({ box }) => box.left <= px && px <= box.right)
+      .map(({ end, box }) => ({ end, apart: Math.abs((box.left + box.right) / 2 - px) }))
+      .sort((one, other) => one.apart - other.apart);
+    return found.filter(({ apart }) => apart < (found[0]?.apart ?? 0) + ALIKE_PX).map(({ end }) => end);
+  }
+
+  /** The end that the pointer has hold of, null while it has not gone one way. @param {number} px CSS px of the window @returns {End | null} */
+  takenBy(px) {
+    if (this.held === null) return null;
+    const { ends, px: from } = this.held;
+    if (ends.length > 1 && Math.abs(px - from) < TURNED_PX) return null;
+    const [taken = null] = ends.length > 1 ? roomiest(ends, Math.sign(px - from)) : ends;
+    if (ends.length > 1) taken?.handle.focus();
+    this.held.ends = taken ? [taken] : [];
+    return taken;
   }
 
   /** @param {KeyboardEvent} event @param {string} key @param {"from"|"to"} end */
@@ -276,4 +308,18 @@ export class IntervalHandles {
       }),
     );
   }
+}
+
+/**
+ * Those of several ends in one place that a drag can move: an interval too short to see is pulled open, and of two
+ * that meet the one behind the pointer is made shorter, since they must not share time.
+ * @param {End[]} ends
+ * @param {number} direction -1 to the left, 1 to the right
+ * @returns {End[]}
+ */
+function roomiest(ends, direction) {
+  const opens = ends.some(({ key }, i) => ends.some((other, j) => j > i && other.key === key));
+  const wanted = direction < 0 === opens ? "from" : "to";
+  const found = ends.filter(({ end }) => end === wanted);
+  return found.length > 0 ? found : ends;
 }

@@ -16,6 +16,10 @@ export const metres = (value_m, decimals = 2) => withUnit(fixed(value_m, decimal
 export const centimetres = (value_m, decimals = 1) => withUnit(fixed(scaled(value_m, 100), decimals), "cm");
 /** @param {number | null | undefined} value_m @param {number} [decimals] */
 export const millimetres = (value_m, decimals = 1) => withUnit(fixed(scaled(value_m, 1000), decimals), "mm");
+/** @param {number | null | undefined} value_s @param {number} [decimals] */
+export const seconds = (value_s, decimals = 2) => withUnit(fixed(value_s, decimals), "s");
+/** @param {number | null | undefined} value_s @param {number} [decimals] */
+export const milliseconds = (value_s, decimals = 1) => withUnit(fixed(scaled(value_s, 1000), decimals), "ms");
 /** @param {number | null | undefined} value_px @param {number} [decimals] */
 export const pixels = (value_px, decimals = 2) => withUnit(fixed(value_px, decimals), "px");
 /** @param {number | null | undefined} value_deg @param {number} [decimals] */

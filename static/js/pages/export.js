@@ -2,7 +2,7 @@
 
 import { get, post, projectPath, sentence } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
-import { centimetres, fixed, millimetres, plural, size } from "../lib/format.js";
+import { centimetres, fixed, millimetres, milliseconds, plural, seconds, size } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { busyOver } from "../components/busy.js";
@@ -249,14 +249,14 @@ function showGps() {
 
 /** @param {number | null} lag_s */
 function lagWords(lag_s) {
-  return lag_s === null ? "–" : `${lag_s > 0 ? "+" : ""}${fixed(lag_s, 3)} s`;
+  return `${lag_s !== null && lag_s > 0 ? "+" : ""}${seconds(lag_s, 3)}`;
 }
 
 /** @param {Validation} given */
 function lagSentence({ lag_s, lag_sigma_s }) {
   if (lag_s === null || !lag_sigma_s) return "The clock lag could not be told.";
   const direction = lag_s > 0 ? "behind" : "ahead of";
-  return `The GPS clock runs ${direction} the video by ${fixed(Math.abs(lag_s), 3)} s (± ${fixed(lag_sigma_s * 1000, 1)} ms), found from the motion itself.`;
+  return `The GPS clock runs ${direction} the video by ${seconds(Math.abs(lag_s), 3)} (±\u202f${milliseconds(lag_sigma_s)}), found from the motion itself.`;
 }
 
 function showTable() {

@@ -66,6 +66,8 @@ const calibrate = h(
 );
 /** @type {string[]} of the GPS file */
 let columnsFound = [];
+/** Files whose cards say what is wrong with them. @type {string[]} */
+let toldOnCards = [];
 const columns = h(
   "button",
   { class: "button small", type: "button", onclick: () => void gpsSettings(store, columnsFound).catch(toastError) },
@@ -133,14 +135,19 @@ async function load({ again = false } = {}) {
     for (const [kind, card] of cards) card.show(facts[kind]);
     columnsFound = facts.gps?.columns_found ?? [];
     columns.hidden = columnsFound.length === 0;
+    toldOnCards = Object.values(facts).flatMap((fact) => (fact?.error ? [fact.file] : []));
   } catch (error) {
     toastError(error);
   }
+  showProblems();
 }
 
-/** Only what concerns the files themselves: later steps tell their own. */
+/** Only what concerns the files themselves and stands on no card: later steps tell their own. */
 function showProblems() {
-  const own = (store.state.problems ?? []).map((problem) => told(problem)).filter(({ step }) => step === "inputs");
+  const own = (store.state.problems ?? [])
+    .filter((problem) => !toldOnCards.some((file) => problem.startsWith(`${file}: `)))
+    .map((problem) => told(problem))
+    .filter(({ step }) => step === "inputs");
   fill(
     problems,
     own.map(({ words }) => h("p", { class: "note warn" }, icon("warn"), h("span", {}, words))),
@@ -167,5 +174,4 @@ store.on("change", ({ project, previous, origin }) => {
 page.events.on("inputs", () => void load());
 page.events.on("job", showJob);
 page.events.on("hello", ({ job: running }) => showJob(running));
-showProblems();
 await Promise.all([load({ again: true }), report.refresh()]);

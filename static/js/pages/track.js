@@ -9,7 +9,7 @@ import { setView, viewText } from "../lib/view-state.js";
 import { busyOver } from "../components/busy.js";
 import { stepUrl } from "../components/header.js";
 import { AXES, fetchHistory, fetchResults, methodName, METHODS } from "../components/histories.js";
-import { isRunning } from "../components/job-card.js";
+import { isRunning, stageWords } from "../components/job-card.js";
 import { note } from "../components/notes.js";
 import { openPage } from "../components/page.js";
 import { problemNote } from "../components/problem-note.js";
@@ -23,14 +23,6 @@ import { announce, toastError } from "../components/toast.js";
 
 // The stage of a measurement that counts frames; the others are short.
 const MEASURING = "measuring";
-/** @type {Record<string, string>} */
-const STAGES = {
-  cloud: "Reading the cloud",
-  measuring: "Measuring frames",
-  solving: "Solving",
-  orthoimage: "Making the orthoimage",
-  "drawing figures": "Drawing figures",
-};
 
 const page = await openPage("track");
 const { store } = page;
@@ -327,8 +319,7 @@ function showRunning(job) {
   const share = job.total > 0 ? job.done / job.total : null;
   const stopping = job.message !== ""; // a running job says nothing else
   const { online } = page.events; // what is heard no more stands still, and is not told as going on
-  const stage = STAGES[job.stage] ?? (job.stage || "Starting");
-  const title = online ? stage : "Connection lost";
+  const title = online ? stageWords(job) : "Connection lost";
   const bar = h("progress", { max: 1, "aria-label": "Progress", value: share, class: online ? null : "frozen" });
   const stop = h(
     "button",

@@ -75,7 +75,7 @@ function showCoverage(element, coverage) {
 function cameraLines({ centre_m, height_m, tilt_deg, azimuth_deg }) {
   const turned_deg = azimuth_deg > 180 ? azimuth_deg - 360 : azimuth_deg;
   return [
-    `Camera ${metres(height_m, 1)} above the ground`,
+    `Camera ${metres(height_m, 1)} above ground`,
     h("br"),
     `at ${fixed(centre_m[0], 1)}, ${fixed(centre_m[1], 1)} m`,
     h("br"),

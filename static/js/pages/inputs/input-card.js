@@ -7,6 +7,7 @@ import { told } from "../../lib/problems.js";
 import { duration, fixed, size } from "../../lib/format.js";
 import { get, projectPath, upload } from "../../lib/api.js";
 import { chooseFiles } from "../../components/file-browser.js";
+import { note } from "../../components/notes.js";
 import { toast, toastError } from "../../components/toast.js";
 import { factList } from "./facts.js";
 
@@ -110,7 +111,12 @@ function understood({ projectId, kind, why }, facts) {
   const path = h("p", { class: "path" }, facts.file);
   if (facts.error) return [path, h("p", { class: "note bad" }, icon("warn"), h("span", {}, told(facts.error.message).words))];
   if (facts.reading) return [path, h("progress", { "aria-label": "Reading" })];
-  return [factList(kind, facts), kind === "video" && still(projectId, facts.file)];
+  return [
+    factList(kind, facts),
+    kind === "video" && still(projectId, facts.file),
+    ...(facts.warnings ?? []).map((/** @type {string} */ words) => note("warn", told(words).words)),
+    ...(facts.notes ?? []).map((/** @type {string} */ words) => note("info", told(words).words)),
+  ];
 }
 
 /** @param {string} projectId @param {string} file changes the address with the video */
