@@ -1,4 +1,4 @@
-"""What a target shows beside its lines: patches of the reference frame, found wherever the target has moved."""
+"""Texture that moves with a target: patches of the reference frame, found wherever the target has moved."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ class Texture:
         pivot: (2,) of the target's apparent rotation, rays of the reference frame; the patches' middle where None.
 
     Attributes:
+        patches: the same, to be found.
         rays0: (N, 2) of their centres in the reference frame.
+        pivot: (2,) as given, or their middle.
     """
 
     def __init__(self, luma: Luma, points_raw: Floats, lens: Lens, pivot: Floats | None = None) -> None:
