@@ -94,7 +94,7 @@ def choose_features(luma: Luma, moving_regions_px: Sequence[Sequence[tuple[float
     Raises:
         InputError: too little of the ground is left to hold on to.
     """
-    points = _spread_corners(luma, ground_mask(luma.shape, moving_regions_px), count)
+    points = _spread_corners(luma, ground_mask(luma.shape, moving_regions_px), count, factor=_choosing_factor(luma))
     if len(points) < LEAST_POINTS:
         raise InputError(
             f"project.json: moving_regions_px leave only {len(points)} ground features in the reference frame; "
@@ -105,19 +105,33 @@ def choose_features(luma: Luma, moving_regions_px: Sequence[Sequence[tuple[float
 
 def choose_features_within(luma: Luma, region_raw: Floats, count: int) -> Floats:
     """Return about `count` corners (N, 2) of the reference frame inside a polygon (M, 2), raw pixels."""
-    region: Luma = np.zeros(luma.shape, dtype=np.uint8)
-    cv2.fillPoly(region, [np.rint(np.nan_to_num(region_raw, nan=-1e4)).astype(np.int32)], 1)
+    corners = np.rint(np.nan_to_num(region_raw, nan=-1e4)).astype(np.int32)
+    reach, size = HALF_PX + MARGIN_PX + 2, np.array(luma.shape[::-1])
+    low, high = np.clip(corners.min(axis=0) - reach, 0, size), np.clip(corners.max(axis=0) + reach + 1, 0, size)
+    if (high - low < 2 * reach).any():
+        return np.empty((0, 2))
+    box = luma[low[1] : high[1], low[0] : high[0]]
+    region: Luma = np.zeros(box.shape, dtype=np.uint8)
+    cv2.fillPoly(region, [corners - low.astype(np.int32)], 1)
     inside = cv2.erode(region, np.ones((2 * HALF_PX + 1, 2 * HALF_PX + 1), np.uint8)).astype(bool)
-    return _spread_corners(luma, inside & ground_mask(luma.shape, ()), count)
+    return _spread_corners(box, inside & ground_mask(box.shape, ()), count, factor=_choosing_factor(luma)) + low
 
 
-def _spread_corners(luma: Luma, allowed: NDArray[np.bool_], count: int) -> Floats:
+def _choosing_factor(luma: Luma) -> int:
+    """Return by how much a frame is reduced before features are chosen."""
+    return max(1, round(luma.shape[1] / CHOOSING_WIDTH))
+
+
+def _spread_corners(luma: Luma, allowed: NDArray[np.bool_], count: int, *, factor: int) -> Floats:
     """Return the strongest corner of each of about `count` cells of the allowed pixels, (N, 2) raw.
+
+    Args:
+        luma: a frame or part of one.
+        factor: by which it is reduced first.
 
     Source: Shi & Tomasi (1994) for the measure of strength.
     """
     height, width = luma.shape
-    factor = max(1, round(width / CHOOSING_WIDTH))
     small = cv2.resize(luma, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(small, (0, 0), 1.0) if factor == 1 else small
     strength = cv2.cornerMinEigenVal(smooth, blockSize=2 * (HALF_PX // factor) + 1, ksize=3)
