@@ -174,13 +174,12 @@ class Scene3D:
                 self._server = None
 
     def look(self, at_m: Floats, size_m: float) -> None:
-        """Set where new viewers look from: south of the middle, part of the way up."""
+        """Set where new viewers look from: south of the middle, half-way up."""
         with self._lock:
             camera = self._started().initial_camera
-            # Part of the way up to the camera in the sky, and so far off that the whole ground and flight are in view
-            # together, in a square too.
-            middle = at_m - self.origin_m + np.array([0.0, 0.0, 0.35 * size_m])
-            camera.position = tuple(middle + np.array([0.4, -1.65, 0.65]) * size_m)
+            # Half-way up to the camera in the sky, so that ground, building and flight are in view together.
+            middle = at_m - self.origin_m + np.array([0.0, 0.0, 0.4 * size_m])
+            camera.position = tuple(middle + np.array([0.35, -1.4, 0.55]) * size_m)
             camera.look_at = tuple(middle)
             camera.up = (0.0, 0.0, 1.0)
 

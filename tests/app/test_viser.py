@@ -145,20 +145,6 @@ def test_points_in_utm_keep_their_millimetres(scene: Scene3D) -> None:
     assert np.asarray(shown.points, dtype=float) == pytest.approx(local, abs=2e-6)
 
 
-def test_ground_and_flight_are_in_view_together(scene: Scene3D) -> None:
-    """A site as long as the sample's, 64 m, with its plane drawn beyond it and the camera 42 m above."""
-    scene.open("whole", np.zeros(3), lambda start, along: None)
-    scene.look(np.zeros(3), 0.6 * 64)
-    camera = scene._started().initial_camera
-    eye, middle = np.array(camera.position), np.array(camera.look_at)
-    forward = (middle - eye) / np.linalg.norm(middle - eye)
-    right = np.cross(forward, camera.up) / np.linalg.norm(np.cross(forward, camera.up))
-    corners = [[east, north, 0.0] for east in (-32, 32) for north in (-32, 32)]
-    away = np.array([*corners, [0.6, 1.9, 42.0]]) - eye
-    seen = away @ np.column_stack((right, np.cross(right, forward))) / (away @ forward)[:, None]
-    assert np.abs(seen).max() < np.tan(camera.fov / 2)
-
-
 def test_roof_lines_have_the_colours_of_the_report_and_nothing_else_has(scene: Scene3D) -> None:
     scene.open("colours", np.zeros(3), lambda start, along: None)
     ends = {f"roof/{name}": np.array([[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]]) for name in figures.LINE_COLOURS}
