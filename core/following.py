@@ -33,7 +33,7 @@ from core.patches import Singles
 from core.project import LINE_NAMES, Target
 from core.robust import finite_median
 from core.roof_lines import NOT_FOUND, STATIONS, LineMatch, LineTracker, find_strips
-from core.texture import Texture
+from core.texture import LEAST_PATCHES, Texture
 from core.video import Luma
 
 # Correlation of the whole target's picture below which it is not recognised.
@@ -58,10 +58,9 @@ LEAST_STATIONS = STATIONS // 4
 # Patches of a points target, and the fewest that make one.
 POINTS = 160
 LEAST_POINTS = 6
-# Patches between the lines of a lines target, and the fewest that tell more than chance. More tell hardly more: what
-# compression gets wrong, it gets wrong for all of them alike.
+# Patches between the lines of a lines target. More tell hardly more: what compression gets wrong, it gets wrong for all
+# of them alike.
 BETWEEN_LINES = 45
-LEAST_BETWEEN_LINES = 12
 
 
 @dataclass(frozen=True)
@@ -262,7 +261,7 @@ def _between(luma: Luma, ends_raw: Floats) -> Floats:
     """Return patches (M, 2) of what lies between lines, given their ends (6, 2), raw pixels; none where it is plain."""
     outline = cv2.convexHull(ends_raw.astype(np.float32))[:, 0]
     points = choose_features_within(luma, np.asarray(outline, dtype=np.float64), BETWEEN_LINES)
-    return points if len(points) >= LEAST_BETWEEN_LINES else points[:0]
+    return points if len(points) >= LEAST_PATCHES else points[:0]
 
 
 def _middles_of_halves(midlines_raw: Floats) -> Floats:

@@ -18,6 +18,7 @@ from core.lens import Lens
 from core.measurements import Recording
 from core.motion import RigidFit, combined_fit
 from core.robust import finite_median, robust_sigma
+from core.texture import LEAST_PATCHES
 
 # How far from the strips' plane patches lie where nothing tells, one standard deviation, metres.
 RELIEF_SIGMA_M = 0.5
@@ -26,9 +27,8 @@ RELIEF_ROUNDS = 2
 OUTLYING = 5.0
 # A patch that departs from the strips' motion by so many times what a place of theirs does shows something else.
 MOST_SCATTER = 4.0
-# A patch must be seen in this part of the frames in which the lines are, and a frame must show so many of them.
+# A patch must be seen in this part of the frames in which the lines are.
 LEAST_SEEN = 0.5
-LEAST_PATCHES = 12
 # Neighbouring places of a strip share blocks of the compression and err alike, so that a patch tells as much as two of
 # them (measured on H.264 clips; between one and four the error hardly changes).
 PLACES_PER_PATCH = 2.0
@@ -65,13 +65,12 @@ def with_texture(
     for _ in range(RELIEF_ROUNDS):
         z = z + patches.raised_by(z, lines, body.centre)
     left = patches.left_over(z, lines, body.centre)
-    belonging = _belonging(left, lines, known)
+    lasting = _lasting(left)
+    belonging = _belonging(left - lasting, lines, known)
     if belonging.sum() < LEAST_PATCHES:
         return lines, np.zeros_like(belonging)
-    # What a patch leaves over in all frames alike is the noise with which the reference frame shows it.
-    places = patches.places(z) - finite_median(np.moveaxis(left, 0, -1))
     texture = RestBody(None, patches.at_rest(z)[belonging], None, body.centre, body.places)
-    motion = texture.fit(places[:, belonging], np.zeros(len(known), dtype=np.bool_))
+    motion = texture.fit((patches.places(z) - lasting)[:, belonging], np.zeros(len(known), dtype=np.bool_))
     enough = (motion.weight > 0.1).sum(axis=1) >= LEAST_PATCHES
     return combined_fit(lines, motion, np.where(enough, PLACES_PER_PATCH, 0.0)), belonging
 
@@ -109,7 +108,7 @@ class _Patches:
         # A patch that lies a metre higher moves more, against the camera, by this part of its motion.
         below = (self.pose0.centre_m[2] - z)[:, None]
         gain = (motion.carried(rest, centre) - rest - (self.poses.centre_m - self.pose0.centre_m)[:, None, :2]) / below
-        left = left - finite_median(np.moveaxis(left, 0, -1))
+        left = left - _lasting(left)
         sigma = _scatter(left)
         seen = (np.abs(left) < OUTLYING * sigma[:, None]).all(axis=-1, keepdims=True)
         count = np.maximum(seen.sum(axis=0), 1)
@@ -119,14 +118,18 @@ class _Patches:
         return np.asarray(explained / np.maximum(information, 1e-300))
 
 
+def _lasting(left: Floats) -> Floats:
+    """Return what patches leave over (F, N, 2) in all frames alike, (N, 2): the noise of the reference frame."""
+    return finite_median(np.moveaxis(left, 0, -1))
+
+
 def _scatter(left: Floats) -> Floats:
     """Return the standard deviation (N,) along an axis of what patches leave over (F, N, 2) in all frames."""
     return robust_sigma(np.moveaxis(left, 0, -1).reshape(left.shape[1], -1))
 
 
 def _belonging(left: Floats, lines: RigidFit, known: Bools) -> Bools:
-    """Return which patches (N,) move with the lines, as what they leave over (F, N, 2) tells."""
+    """Return which patches (N,) move with the lines, as what they leave over from frame to frame (F, N, 2) tells."""
     seen = finite_rows(left).sum(axis=0) >= LEAST_SEEN * known.sum()
-    own = left - finite_median(np.moveaxis(left, 0, -1))
     usual = float(np.median(finite_median(lines.sigma[known])))
-    return np.asarray(seen & (_scatter(own) < MOST_SCATTER * usual), dtype=np.bool_)
+    return np.asarray(seen & (_scatter(left) < MOST_SCATTER * usual), dtype=np.bool_)

@@ -10,7 +10,7 @@ from core.coordinates import Floats, rotation_2d
 from core.measurements import Recording
 from core.results import TargetHistory
 from core.solve import solve
-from core.texture_motion import LEAST_PATCHES
+from core.texture import LEAST_PATCHES
 from tests import exact_scene as scene
 
 # Of the edges of the strips and of the patches between them; the ground is seen without noise.
