@@ -185,9 +185,18 @@ def test_an_edit_whose_answer_is_lost_on_its_way_is_made_once(browser, project):
         page.goto(f"{pages}/correspondences?pair=3")
         ready(page, "Reference frame")
         pane(page, "Reference frame").focus()
-        page.route(of_project(pages), lambda route: (route.fetch(), route.abort()), times=1)
+        taken: list[APIResponse] = []
+
+        def lose_the_answer(route: Route) -> None:
+            if not taken:
+                taken.append(route.fetch())
+            route.abort()
+
+        page.route(of_project(pages), lose_the_answer)
         page.keyboard.press("ArrowRight")
         expect(page.locator(".save-state")).to_have_attribute("data-state", "waiting")
+        assert taken[0].ok
+        page.unroute(of_project(pages))
         saved(page)
         expect(page.get_by_role("alert")).to_have_count(0)
     assert read_project(folder).correspondences[2].frame_px == (pytest.approx(u + 0.1), v)
