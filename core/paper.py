@@ -14,7 +14,7 @@ Extraction"; SIFT (Lowe 2004) stands for SURF, which OpenCV's packages do not ca
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from core.apparent import Apparent
-from core.coordinates import Floats, apply_homography, batches
+from core.coordinates import Floats, apply_homography
 from core.errors import InputError
 from core.following import Scale, TargetFinder
 from core.ground import CameraFinder, fit_homography, ground_mask
@@ -40,12 +40,13 @@ from core.video import Luma
 # Matches per frame of the paper: 300-500.
 FEATURES = 500
 LEAST_MATCHES = 20
-# Half the side of the window SIFT looks into around an expected feature, pixels: where a descriptor's weight lies at
-# the scales kept, and what a match may lie off. Wider windows match no more features.
-WINDOW_PX = 20
-# Windows are laid out in squares of so many a side: what SIFT makes of such a picture stays near the processor.
-SIDE_BY_SIDE = 4
 LARGEST_SIZE_PX = 5.0
+# Half the side of the windows SIFT looks into around expected features, pixels. A feature takes the first that is as
+# many times its size: there a descriptor's weight lies, and what a match may lie off. Wider ones match no more.
+WINDOWS_PX = (10, 12, 14, 16, 18, 20)
+WINDOW_BY_SIZE = 5.0
+# Windows are laid out in squares of about this side, pixels: what SIFT makes of one stays near the processor.
+MOSAIC_PX = 160
 # How far from its expected place a match may lie, pixels.
 NEAR_PX = 4.0
 # Difference of two descriptors beyond which they show different places, out of 512.
@@ -76,6 +77,23 @@ class Candidates:
     number: NDArray[np.int64]
     places: Floats
     descriptors: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Mosaic:
+    """W square windows of a frame side by side, a row of them after the other.
+
+    Attributes:
+        picture: of all of them.
+        side: of a window, pixels.
+        number: (W,) of the feature expected in the middle of each.
+        corner: (W, 2) each one's first pixel in the frame.
+    """
+
+    picture: Luma
+    side: int
+    number: NDArray[np.int64]
+    corner: NDArray[np.int64]
 
 
 class PaperMeasurer:
@@ -137,6 +155,9 @@ class SiftGround:
         self._descriptors = descriptors[kept]
         self.points_raw = np.array([keypoints[i].pt for i in kept], dtype=np.float64)
         self._rays0 = lens.rays_from_raw(self.points_raw)
+        sizes = np.array([keypoints[i].size for i in kept])
+        fitting = np.searchsorted(WINDOWS_PX, WINDOW_BY_SIZE * sizes).clip(max=len(WINDOWS_PX) - 1)
+        self._half_px = np.array(WINDOWS_PX)[fitting]
         self._finder = CameraFinder(luma, lens, allowed)
 
     def find(self, luma: Luma, predicted_H_ray_ray0: Floats | None) -> tuple[Floats, Floats] | None:
@@ -165,7 +186,7 @@ class SiftGround:
 
         That must be small, and clearly less than any other's.
         """
-        windows = len(expected_raw) * (2 * WINDOW_PX) ** 2
+        windows = int(((2 * self._half_px) ** 2).sum())
         look = self._seen_in_windows if luma.size > 1.5 * windows else self._seen_in_all
         seen = look(luma, expected_raw)
         difference = ((seen.descriptors - self._descriptors[seen.number]) ** 2).sum(axis=1)
@@ -192,25 +213,34 @@ class SiftGround:
 
     def _seen_in_windows(self, luma: Luma, expected_raw: Floats) -> Candidates:
         """Return what SIFT finds in windows around each expected feature."""
-        windows, corners, index = _windows(luma, expected_raw)
-        if not windows:
-            return Candidates(index, np.empty((0, 2)), np.empty((0, 128), dtype=np.float32))
-        some = list(batches(len(windows), SIDE_BY_SIDE**2))
-        seen = on_all_cores(lambda few: self._seen_in_mosaic(windows[few]), some)
-        window = np.concatenate([few.start + each.number for few, each in zip(some, seen, strict=True)])
-        number, places = index[window], np.concatenate([each.places for each in seen]) + corners[window]
+        seen = on_all_cores(self._seen_in_mosaic, list(self._mosaics(luma, expected_raw)))
+        if not seen:
+            return Candidates(np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty((0, 128), dtype=np.float32))
+        number = np.concatenate([each.number for each in seen])
+        places = np.concatenate([each.places for each in seen])
         descriptors = np.concatenate([each.descriptors for each in seen])
         near = np.linalg.norm(places - expected_raw[number], axis=1) < NEAR_PX
         return Candidates(number[near], places[near], descriptors[near])
 
-    def _seen_in_mosaic(self, windows: Sequence[Luma]) -> Candidates:
-        """Return what SIFT finds near the middles of windows laid side by side, by their numbers and places in them."""
-        side = 2 * WINDOW_PX
-        mosaic = _mosaic(windows)
-        middles = np.stack(np.divmod(np.arange(len(windows)), SIDE_BY_SIDE)[::-1], axis=1) * side + WINDOW_PX
-        places, descriptors = self._detect(mosaic, _around(mosaic.shape, middles))
-        tile = (places // side).astype(np.int64)
-        return Candidates(tile[:, 1] * SIDE_BY_SIDE + tile[:, 0], places - tile * side, descriptors)
+    def _mosaics(self, luma: Luma, expected_raw: Floats) -> Iterator[_Mosaic]:
+        """Return the windows around expected features that lie in the frame, those of one size side by side."""
+        for half in WINDOWS_PX:
+            corners = np.rint(np.nan_to_num(expected_raw, nan=-1e6)).astype(np.int64) - half
+            inside = (corners >= 0).all(axis=1) & (corners + 2 * half <= np.array(luma.shape[::-1])).all(axis=1)
+            numbers = np.flatnonzero(inside & (self._half_px == half))
+            together = (MOSAIC_PX // (2 * half)) ** 2
+            for first in range(0, len(numbers), together):
+                some = numbers[first : first + together]
+                yield _mosaic(luma, some, corners[some], half)
+
+    def _seen_in_mosaic(self, mosaic: _Mosaic) -> Candidates:
+        """Return what SIFT finds near the middles of the windows of a mosaic."""
+        columns = mosaic.picture.shape[1] // mosaic.side
+        middles = np.stack(np.divmod(np.arange(len(mosaic.number)), columns)[::-1], axis=1) + 0.5
+        places, descriptors = self._detect(mosaic.picture, _around(mosaic.picture.shape, middles * mosaic.side))
+        tile = (places // mosaic.side).astype(np.int64)
+        window = tile[:, 1] * columns + tile[:, 0]
+        return Candidates(mosaic.number[window], places - tile * mosaic.side + mosaic.corner[window], descriptors)
 
 
 def _two_least(number: NDArray[np.int64], value: NDArray[np.float32]) -> tuple[NDArray[np.int64], Floats]:
@@ -253,24 +283,15 @@ def _around(shape: tuple[int, ...], places: Floats) -> Luma:
     return mask
 
 
-def _windows(luma: Luma, expected_raw: Floats) -> tuple[list[Luma], Floats, NDArray[np.int64]]:
-    height, width = luma.shape
-    corners = np.rint(np.nan_to_num(expected_raw, nan=-1e6)) - WINDOW_PX
-    inside = (corners >= 0).all(axis=1) & (corners + 2 * WINDOW_PX <= np.array([width, height])).all(axis=1)
-    index = np.flatnonzero(inside)
-    side = 2 * WINDOW_PX
-    windows = [luma[int(v) : int(v) + side, int(u) : int(u) + side] for u, v in corners[index]]
-    return windows, corners[index], index
-
-
-def _mosaic(windows: Sequence[Luma]) -> Luma:
-    side = 2 * WINDOW_PX
-    rows = -(-len(windows) // SIDE_BY_SIDE)
-    mosaic = np.zeros((rows * side, SIDE_BY_SIDE * side), dtype=np.uint8)
-    for number, window in enumerate(windows):
-        top, left = number // SIDE_BY_SIDE * side, number % SIDE_BY_SIDE * side
-        mosaic[top : top + side, left : left + side] = window
-    return mosaic
+def _mosaic(luma: Luma, number: NDArray[np.int64], corner: NDArray[np.int64], half: int) -> _Mosaic:
+    """Return the windows of some features side by side, given each one's first pixel (W, 2)."""
+    side = 2 * half
+    columns = MOSAIC_PX // side
+    picture = np.zeros((-(-len(number) // columns) * side, columns * side), dtype=np.uint8)
+    for place, (u, v) in enumerate(corner.tolist()):
+        top, left = place // columns * side, place % columns * side
+        picture[top : top + side, left : left + side] = luma[v : v + side, u : u + side]
+    return _Mosaic(picture, side, number, corner)
 
 
 class CannyLines:

@@ -46,12 +46,12 @@ def test_windows_find_the_matches_that_the_whole_frame_gives(monkeypatch: pytest
     ground = SiftGround(luma, scene.LENS, np.ones(luma.shape, dtype=bool))
     shift = np.array([1.0, -2.0])
     moved = np.roll(luma, (-2, 1), axis=(0, 1))
-    assert luma.size > 1.5 * COUNT * (2 * paper.WINDOW_PX) ** 2, "the frame must be large enough for windows"
+    assert luma.size > 1.5 * COUNT * (2 * paper.WINDOWS_PX[-1]) ** 2, "the frame must be large enough for windows"
     expected = ground.points_raw + shift + 0.4
     in_windows = ground._match(moved, expected)
     monkeypatch.setattr(SiftGround, "_seen_in_windows", SiftGround._seen_in_all)
     in_all = ground._match(moved, expected)
-    margin = paper.WINDOW_PX + 5
+    margin = paper.WINDOWS_PX[-1] + 5
     inside = ((expected > margin) & (expected < np.array(SIZE) - margin)).all(axis=1)
     found = np.isfinite(in_all).all(axis=1) & inside
     assert found.sum() > 60
