@@ -378,8 +378,8 @@ def _tracked_figure(results: Results, target: Target, luma: NDArray[np.uint8]) -
     else:
         lines, points = fitted_lines(measured, solution.lens)
         edges = {name: edge.reshape(-1, 2) for name, edge in zip(LINE_NAMES, measured, strict=True)}
-        between = reference.texture_raw.get(target.name, np.empty((0, 2)))
-        edges["between"] = between[solution.targets[target.name].texture_used]
+        texture = reference.texture_raw.get(target.name, np.empty((0, 2)))
+        edges["texture"] = texture[solution.targets[target.name].texture_used]
     return figures.frame_figure(
         luma,
         lines_px=lines,

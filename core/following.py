@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from core.apparent import Apparent
 from core.coordinates import Floats, apply_homography, finite_rows
 from core.errors import InputError
-from core.ground import ALIKE_SCORE, NOISY_ROUNDS, View, choose_features_within
+from core.ground import ALIKE_SCORE, NOISY_ROUNDS, Regions, View, choose_features_within
 from core.lens import Lens
 from core.motion import (
     LineSet,
@@ -58,9 +58,10 @@ LEAST_STATIONS = STATIONS // 4
 # Patches of a points target, and the fewest that make one.
 POINTS = 160
 LEAST_POINTS = 6
-# Patches between the lines of a lines target. More tell hardly more: what compression gets wrong, it gets wrong for all
-# of them alike.
-BETWEEN_LINES = 45
+# Patches about the lines of a lines target, and how far the rectangle in which they lie reaches, as multiple of the
+# lines' own: spread over more of the roof they share less of what compression gets wrong. More tell hardly more.
+ABOUT_LINES = 80
+REACH_OF_LINES = 1.5
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class TargetMatch:
     Attributes:
         raw: measured raw pixels: (L, STATIONS, 2, 2) edges of lines, or (N, 2) patches of points; nan where none.
         apparent: its motion, or None where it could not be determined.
-        texture_raw: (M, 2) patches between the lines, nan where not found; (0, 2) for points.
+        texture_raw: (M, 2) patches about the lines, nan where not found; (0, 2) for points.
     """
 
     raw: Floats
@@ -121,12 +122,15 @@ class Scale:
     pixels_per_m: float
 
 
-def make_follower(luma: Luma, target: Target, to_ray0: Callable[[Floats], Floats], lens: Lens) -> Follower:
+def make_follower(
+    luma: Luma, target: Target, to_ray0: Callable[[Floats], Floats], lens: Lens, moving_regions_px: Regions = ()
+) -> Follower:
     """Return a follower for a target.
 
     Args:
         luma: the reference frame.
         to_ray0: from plan metres (N, 2) to rays of the reference frame.
+        moving_regions_px: polygons, raw pixels, beyond which nothing moves; anything may where there are none.
 
     Raises:
         InputError: a band holds no line, or a region no texture.
@@ -138,7 +142,9 @@ def make_follower(luma: Luma, target: Target, to_ray0: Callable[[Floats], Floats
         widths = [band.width_m * scale.pixels_per_m for band in bands]
         names = [f"project.json: targets.{target.name}.lines.{name}" for name in LINE_NAMES]
         ends = to_ray0(corners.reshape(-1, 2)).reshape(-1, 2, 2)
-        return LinesFollower(luma, ends, lens, widths_px=widths, scale=scale, names=names)
+        return LinesFollower(
+            luma, ends, lens, widths_px=widths, scale=scale, names=names, moving_regions_px=moving_regions_px
+        )
     region = np.array(target.region_m)
     scale = _scale(region, to_ray0, lens)
     return PointsFollower(luma, to_ray0(region), lens, scale=scale, name=f"project.json: targets.{target.name}")
@@ -153,17 +159,18 @@ def _scale(plan_m: Floats, to_ray0: Callable[[Floats], Floats], lens: Lens) -> S
 
 
 class LinesFollower:
-    """Follows L1, L2 and T1 of a target together, and patches of what lies between them.
+    """Follows L1, L2 and T1 of a target together, and patches of what lies about them.
 
     Args:
         luma: the reference frame, (height, width).
         ends: (3, 2, 2) both ends of each band's axis, rays of the reference frame.
         widths_px: full width of each band, raw pixels.
         names: of the bands, for messages.
+        moving_regions_px: as for `make_follower`.
 
     Attributes:
         reference_raw: (3, STATIONS, 2, 2) edges in the reference frame, raw pixels; nan where not found.
-        reference_texture_raw: (M, 2) patches between the lines, raw pixels; none where it is plain there.
+        reference_texture_raw: (M, 2) patches about the lines, raw pixels; none where it is plain there.
         texture: the same.
 
     Raises:
@@ -171,7 +178,15 @@ class LinesFollower:
     """
 
     def __init__(
-        self, luma: Luma, ends: Floats, lens: Lens, *, widths_px: list[float], scale: Scale, names: list[str]
+        self,
+        luma: Luma,
+        ends: Floats,
+        lens: Lens,
+        *,
+        widths_px: list[float],
+        scale: Scale,
+        names: list[str],
+        moving_regions_px: Regions = (),
     ) -> None:
         self._lens = lens
         self._scale = scale
@@ -194,7 +209,8 @@ class LinesFollower:
         lines = [fit_line(points, np.ones(STATIONS), self._centre) for points in rays]
         self._lines = LineSet(np.array([n for n, _ in lines]), np.array([o for _, o in lines]), self._centre)
         self._whole = self._rigid(matches, np.eye(3)).normal[0]
-        self.reference_texture_raw = _between(luma, lens.raw_from_rays(ends.reshape(-1, 2)))
+        ends_raw = lens.raw_from_rays(ends.reshape(-1, 2)).reshape(ends.shape)
+        self.reference_texture_raw = _about(luma, ends_raw, moving_regions_px)
         self.texture = Texture(luma, self.reference_texture_raw, lens, self._centre)
         self._finder = TargetFinder(luma, ends.reshape(-1, 2), lens, scale)
 
@@ -207,7 +223,7 @@ class LinesFollower:
     def find(
         self, luma: Luma, H_ray_ray0: Floats, predicted: Apparent | None, *, confirm: bool, is_view: bool = False
     ) -> TargetMatch:
-        """Return the lines in a frame and what lies between them; see `Follower.find`."""
+        """Return the lines in a frame and what lies about them; see `Follower.find`."""
         lines = self._lines_in(luma, H_ray_ray0, predicted, confirm=confirm)
         if lines.apparent is None:
             return replace(lines, texture_raw=np.full_like(self.reference_texture_raw, np.nan))
@@ -257,10 +273,14 @@ class LinesFollower:
         return to_raw
 
 
-def _between(luma: Luma, ends_raw: Floats) -> Floats:
-    """Return patches (M, 2) of what lies between lines, given their ends (6, 2), raw pixels; none where it is plain."""
-    outline = cv2.convexHull(ends_raw.astype(np.float32))[:, 0]
-    points = choose_features_within(luma, np.asarray(outline, dtype=np.float64), BETWEEN_LINES)
+def _about(luma: Luma, ends_raw: Floats, moving_regions_px: Regions) -> Floats:
+    """Return patches (M, 2) of what lies about lines with ends (3, 2, 2), raw pixels; none where it is plain."""
+    u, v = (ends_raw[0, 1] - ends_raw[0, 0]) / np.linalg.norm(ends_raw[0, 1] - ends_raw[0, 0])
+    along_l1 = np.array([[u, v], [-v, u]])
+    places = ends_raw.reshape(-1, 2) @ along_l1.T
+    low, high = places.min(axis=0), places.max(axis=0)
+    corners = (low + high) / 2 + REACH_OF_LINES * (high - low) / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    points = choose_features_within(luma, corners @ along_l1, ABOUT_LINES, bounds=moving_regions_px)
     return points if len(points) >= LEAST_PATCHES else points[:0]
 
 

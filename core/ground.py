@@ -20,6 +20,9 @@ from core.lens import Lens
 from core.patches import HALF_PX, MARGIN_PX, Matches, PatchTracker, Singles
 from core.video import Luma
 
+# Polygons, raw pixels of the reference frame.
+Regions = Sequence[Sequence[tuple[float, float]]]
+
 # More give no better pose: what compression gets wrong, it gets wrong for all of them alike.
 FEATURES = 180
 # Correlation from which two noisy views are alike by more than chance.
@@ -88,7 +91,7 @@ class ExpectedFeatures:
         return np.asarray(self.rays + (invert_2x2(self.J_raw_rays) @ (raw - self.raw)[..., None])[..., 0])
 
 
-def choose_features(luma: Luma, moving_regions_px: Sequence[Sequence[tuple[float, float]]], count: int) -> Floats:
+def choose_features(luma: Luma, moving_regions_px: Regions, count: int) -> Floats:
     """Return about `count` corners (N, 2) of the reference frame, raw pixels, evenly spread outside the regions.
 
     Raises:
@@ -103,8 +106,12 @@ def choose_features(luma: Luma, moving_regions_px: Sequence[Sequence[tuple[float
     return points
 
 
-def choose_features_within(luma: Luma, region_raw: Floats, count: int) -> Floats:
-    """Return about `count` corners (N, 2) of the reference frame inside a polygon (M, 2), raw pixels."""
+def choose_features_within(luma: Luma, region_raw: Floats, count: int, *, bounds: Regions = ()) -> Floats:
+    """Return about `count` corners (N, 2) of the reference frame inside a polygon (M, 2), raw pixels.
+
+    Args:
+        bounds: polygons in one of which corners must lie too, if there are any.
+    """
     corners = np.rint(np.nan_to_num(region_raw, nan=-1e4)).astype(np.int32)
     reach, size = HALF_PX + MARGIN_PX + 2, np.array(luma.shape[::-1])
     low, high = np.clip(corners.min(axis=0) - reach, 0, size), np.clip(corners.max(axis=0) + reach + 1, 0, size)
@@ -113,6 +120,11 @@ def choose_features_within(luma: Luma, region_raw: Floats, count: int) -> Floats
     box = luma[low[1] : high[1], low[0] : high[0]]
     region: Luma = np.zeros(box.shape, dtype=np.uint8)
     cv2.fillPoly(region, [corners - low.astype(np.int32)], 1)
+    if bounds:
+        within = np.zeros_like(region)
+        for bound in bounds:
+            cv2.fillPoly(within, [(np.rint(np.array(bound)) - low).astype(np.int32)], 1)
+        region &= within
     inside = cv2.erode(region, np.ones((2 * HALF_PX + 1, 2 * HALF_PX + 1), np.uint8)).astype(bool)
     return _spread_corners(box, inside & ground_mask(box.shape, ()), count, factor=_choosing_factor(luma)) + low
 
@@ -152,9 +164,7 @@ def _spread_corners(luma: Luma, allowed: NDArray[np.bool_], count: int, *, facto
     return np.asarray(points[inside], dtype=np.float64)
 
 
-def ground_mask(
-    shape: tuple[int, ...], moving_regions_px: Sequence[Sequence[tuple[float, float]]]
-) -> NDArray[np.bool_]:
+def ground_mask(shape: tuple[int, ...], moving_regions_px: Regions) -> NDArray[np.bool_]:
     """Return the (height, width) mask of raw pixels whose patches lie inside the frame and outside what moves."""
     mask: Luma = np.ones(shape[:2], dtype=np.uint8)
     for region in moving_regions_px:

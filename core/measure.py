@@ -109,7 +109,8 @@ class GeometricMeasurer:
         allowed = ground_mask(luma.shape, setup.moving_regions_px)
         self._ground = GroundTracker(luma, points, setup.lens, allowed)
         self._followers = {
-            target.name: make_follower(luma, target, setup.rays_from_plan, setup.lens) for target in setup.targets
+            target.name: make_follower(luma, target, setup.rays_from_plan, setup.lens, setup.moving_regions_px)
+            for target in setup.targets
         }
         self.reference = Reference(
             points,

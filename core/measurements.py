@@ -41,7 +41,7 @@ class Reference:
     Attributes:
         ground_raw: (N, 2) ground features.
         targets_raw: per target, (L, S, 2, 2) edges of lines or (M, 2) patches of points.
-        texture_raw: per target, (M, 2) patches between its lines; none of a target that is not named.
+        texture_raw: per target, (M, 2) patches about its lines; none of a target that is not named.
     """
 
     ground_raw: Floats
@@ -84,7 +84,7 @@ class Recording:
     texture_raw: Mapping[str, Floats] = field(default_factory=dict)
 
     def texture_of(self, name: str) -> Floats:
-        """Return the patches between the lines of a target, (F, M, 2); none where none were looked for."""
+        """Return the patches about the lines of a target, (F, M, 2); none where none were looked for."""
         return self.texture_raw.get(name, np.empty((len(self.frame), 0, 2)))
 
     def selected(self, chosen: NDArray[np.int64]) -> Recording:
@@ -240,7 +240,7 @@ class MeasurementStore:
 
 
 def _by_target(names: Sequence[str], measured: Reference | FrameMeasurement) -> Iterator[Floats]:
-    """Yield what is measured of every target, and then what between its lines."""
+    """Yield what is measured of every target, and then what about its lines."""
     yield from (measured.targets_raw[name] for name in names)
     yield from (measured.texture_raw.get(name, np.empty((0, 2))) for name in names)
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from core.georeference import ReferenceFit
 
 # Raised whenever the same video would be measured differently: older recordings are then not continued.
-MEASURE_VERSION = 10
+MEASURE_VERSION = 11
 # Over a longer gap nothing goes on as it was, and the last place is as good a guess as any.
 MOST_STEPS = 2.0
 

@@ -32,7 +32,7 @@ class TargetOverlay:
         edges_raw: by line, (N, 2) the edge points that were found.
         lines_raw: by line, (33, 2) the fitted mid-line.
         bands_raw: by line, (M, 2) outline of where it was looked for, moved along with the target.
-        points_raw: (N, 2) patches of a points target, or those between lines that move with them.
+        points_raw: (N, 2) patches of a points target, or those about lines that move with them.
         points_rejected_raw: (N, 2) those that do not.
         p1_raw, p2_raw: (2,) where the lines cross; None where they do not.
     """

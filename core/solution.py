@@ -63,7 +63,7 @@ class TargetSolution:
         rest_m: (2, 2) P1 and P2 at rest, absolute world metres.
         growth: (F,) by what part of itself the target appears larger than at rest, nan where not measured; None for
             `paper`, whose scale follows what it sees.
-        texture_used: (M,) which patches between its lines move with them and took part.
+        texture_used: (M,) which patches about its lines move with them and took part.
     """
 
     history: TargetHistory

@@ -10,7 +10,7 @@ from core.lens import Lens
 from core.patches import PatchTracker, Singles
 from core.video import Luma
 
-# Fewer patches between lines tell no more than chance: what a roof shows is then not looked for, and a frame that shows
+# Fewer patches about lines tell no more than chance: what a roof shows is then not looked for, and a frame that shows
 # no more of it is measured by its lines alone.
 LEAST_PATCHES = 12
 

@@ -1,8 +1,9 @@
-"""What the texture between a target's lines adds to their motion.
+"""What the texture about a target's lines adds to their motion.
 
-One strip alone tells the motion along the other two, and compression moves a strip as it likes; patches between the
+One strip alone tells the motion along the other two, and compression moves a strip as it likes; patches about the
 strips are spread over many of its blocks. They move with the strips but lie at heights of their own, a parapet below
-them or on a duct: how far from the strips' plane is read off how much more than these each patch seems to move.
+them or on a duct: how far from the strips' plane is read off how much more than these each patch seems to move. Nobody
+has said that all of them lie on the roof, so only those take part whose height and motion say so.
 """
 
 from __future__ import annotations
@@ -23,6 +24,11 @@ from core.texture import LEAST_PATCHES
 # How far from the strips' plane patches lie where nothing tells, one standard deviation, metres.
 RELIEF_SIGMA_M = 0.5
 RELIEF_ROUNDS = 2
+# A patch takes part where it is known to be no further from the strips' plane than this, in metres: it may lie on a
+# lower roof or on the ground else, which moves as little as the roof in weak shaking.
+MOST_RELIEF_M = 1.5
+# One standard deviation of a height that counts as known, metres.
+KNOWN_RELIEF_M = 0.2
 # What is left of a patch in a frame counts as an outlier beyond so many standard deviations.
 OUTLYING = 5.0
 # A patch that departs from the strips' motion by so many times what a place of theirs does shows something else.
@@ -46,7 +52,7 @@ def with_texture(
     poses: PoseFit,
     z_m: float,
 ) -> tuple[RigidFit, Bools]:
-    """Return the motion of a target's lines and the texture between them together, and which patches (N,) took part.
+    """Return the motion of a target's lines and the texture about them together, and which patches (N,) took part.
 
     Args:
         lines: motion of the lines alone.
@@ -61,12 +67,14 @@ def with_texture(
         return lines, np.zeros(raw.shape[1], dtype=np.bool_)
     rays = lens.rays_from_raw(np.where(known[:, None, None], raw, np.nan))
     patches = _Patches(rays, lens.rays_from_raw(recording.reference.texture_raw[name]), pose0, poses)
-    z = np.full(raw.shape[1], z_m)
+    z, sigma_m = np.full(raw.shape[1], z_m), np.zeros(raw.shape[1])
     for _ in range(RELIEF_ROUNDS):
-        z = z + patches.raised_by(z, lines, body.centre)
+        raised, sigma_m = patches.raised_by(z, lines, body.centre)
+        z = z + raised
+    near = (np.abs(z - z_m) < MOST_RELIEF_M) & (sigma_m < KNOWN_RELIEF_M)
     left = patches.left_over(z, lines, body.centre)
     lasting = _lasting(left)
-    belonging = _belonging(left - lasting, lines, known)
+    belonging = near & _belonging(left - lasting, lines, known)
     if belonging.sum() < LEAST_PATCHES:
         return lines, np.zeros_like(belonging)
     texture = RestBody(None, patches.at_rest(z)[belonging], None, body.centre, body.places)
@@ -102,8 +110,11 @@ class _Patches:
         """Return how far beyond a motion about a centre the patches are (F, N, 2)."""
         return self.places(z) - motion.carried(self.at_rest(z), centre)
 
-    def raised_by(self, z: Floats, motion: RigidFit, centre: Floats) -> Floats:
-        """Return how much higher (N,) than z patches must lie for what they leave over of a motion to be parallax."""
+    def raised_by(self, z: Floats, motion: RigidFit, centre: Floats) -> tuple[Floats, Floats]:
+        """Return how much higher (N,) than z patches must lie for what they leave over of a motion to be parallax.
+
+        And one standard deviation of that, metres.
+        """
         left, rest = self.left_over(z, motion, centre), self.at_rest(z)
         # A patch that lies a metre higher moves more, against the camera, by this part of its motion.
         below = (self.pose0.centre_m[2] - z)[:, None]
@@ -115,7 +126,7 @@ class _Patches:
         gain = np.where(seen, gain - np.where(seen, gain, 0.0).sum(axis=0) / count, 0.0)
         information = (gain**2).sum(axis=(0, 2)) + (sigma / RELIEF_SIGMA_M) ** 2
         explained = (gain * np.where(seen, left, 0.0)).sum(axis=(0, 2))
-        return np.asarray(explained / np.maximum(information, 1e-300))
+        return explained / np.maximum(information, 1e-300), sigma / np.sqrt(np.maximum(information, 1e-300))
 
 
 def _lasting(left: Floats) -> Floats:

@@ -178,6 +178,17 @@ def test_the_overlay_lies_where_the_engine_measured(browser, finished, ratio):
         features_agree(page, np.array(measured["ground"]["used"]), closer, ratio)
 
 
+def test_a_frame_says_what_took_part_and_what_did_not(browser, finished):
+    measured = ask(finished, f"review/{FRAME}")
+    ground, patches = measured["ground"], measured["targets"]["roof"]["points_raw"]
+    assert len(patches["used"]) > 12
+    with watched(browser, finished) as page:
+        page.goto(f"{finished}/review?frame={FRAME}")
+        facts = page.get_by_label("This frame", exact=True)
+        expect(facts).to_contain_text(f"{len(ground['used'])} features used, {len(ground['rejected'])} rejected")
+        expect(facts).to_contain_text(f"{len(patches['used'])} patches used, {len(patches['rejected'])} rejected")
+
+
 MARK_IS_NEAR = """([x, y]) => {
     const place = document.querySelector('[data-id="roof/p1"]').transform.baseVal.getItem(0).matrix;
     return Math.hypot(place.e - x, place.f - y) < 5;

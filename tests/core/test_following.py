@@ -10,9 +10,9 @@ from core.apparent import Apparent
 from core.coordinates import Floats
 from core.errors import InputError
 from core.following import LinesFollower, PointsFollower, Scale
-from core.ground import View
+from core.ground import Regions, View
 from core.lens import Lens
-from core.patches import SETTLED_PX
+from core.patches import HALF_PX, SETTLED_PX
 from core.video import Luma
 from tests.waves import frame, pixels, waves
 
@@ -34,10 +34,13 @@ def roof() -> Luma:
     return frame(0.5 * waves(6)(place) + 110.0 / (1.0 + np.exp((across - 3.0) / 0.5)))
 
 
-def follower() -> LinesFollower:
+def follower(moving_regions_px: Regions = ()) -> LinesFollower:
     ends = LENS.rays_from_raw(BANDS.astype(float))
     scale = Scale(rays_per_m=PX_PER_M / FOCAL_PX, pixels_per_m=PX_PER_M)
-    return LinesFollower(roof(), ends, LENS, widths_px=[14.0] * 3, scale=scale, names=["L1", "L2", "T1"])
+    names = ["L1", "L2", "T1"]
+    return LinesFollower(
+        roof(), ends, LENS, widths_px=[14.0] * 3, scale=scale, names=names, moving_regions_px=moving_regions_px
+    )
 
 
 def test_bands_that_hold_nothing_but_noise_are_refused() -> None:
@@ -110,27 +113,36 @@ def test_a_region_without_texture_is_refused() -> None:
         PointsFollower(frame(np.full(SIZE[::-1], 128.0)), region, LENS, scale=scale, name="targets.roof")
 
 
-def test_what_lies_between_lines_is_found_where_they_are() -> None:
+def test_what_lies_about_lines_is_found_where_they_are() -> None:
     lines = follower()
     within = lines.reference_texture_raw
     assert len(within) >= 12
-    assert ((within >= BANDS.min(axis=(0, 1))) & (within <= BANDS.max(axis=(0, 1)))).all()
+    low, high = BANDS.min(axis=(0, 1)), BANDS.max(axis=(0, 1))
+    assert ((within < low) | (within > high)).any(), "the roof goes on beyond the lines"
+    reach = 0.25 * (high - low)
+    assert ((within >= low - reach) & (within <= high + reach)).all()
     moved = np.roll(roof(), (3, -2), axis=(0, 1))
     found = lines.find(moved, np.eye(3), Apparent(np.array([-1.0, 2.0]) / FOCAL_PX, 0.0), confirm=False)
     np.testing.assert_allclose(found.texture_raw - within, np.broadcast_to([-2.0, 3.0], within.shape), atol=SETTLED_PX)
 
 
-def test_without_lines_nothing_is_looked_for_between_them() -> None:
+def test_what_lies_beyond_what_moves_is_not_followed() -> None:
+    low, high = (190.0, 110.0), (360.0, 280.0)
+    within = follower([[low, (high[0], low[1]), high, (low[0], high[1])]]).reference_texture_raw
+    assert len(within) >= 12
+    inner = HALF_PX - 0.5
+    assert ((within >= np.array(low) + inner) & (within <= np.array(high) - inner)).all()
+
+
+def test_without_lines_nothing_is_looked_for_about_them() -> None:
     plain = frame(np.full(SIZE[::-1], 110.0))
     found = follower().find(plain, np.eye(3), Apparent.none(), confirm=False)
     assert found.apparent is None
     assert np.isnan(found.texture_raw).all()
 
 
-def test_between_lines_that_leave_little_room_nothing_is_followed() -> None:
-    ends = LENS.rays_from_raw(np.array([[[232, 150], [268, 150]], [[232, 180], [268, 180]], [[250, 146], [250, 184]]]))
-    scale = Scale(rays_per_m=PX_PER_M / FOCAL_PX, pixels_per_m=PX_PER_M)
-    lines = LinesFollower(roof(), ends, LENS, widths_px=[14.0] * 3, scale=scale, names=["L1", "L2", "T1"])
+def test_about_lines_that_leave_little_room_nothing_is_followed() -> None:
+    lines = follower([[(235.0, 150.0), (265.0, 150.0), (265.0, 180.0), (235.0, 180.0)]])
     assert lines.reference_texture_raw.shape == (0, 2)
     found = lines.find(np.roll(roof(), 2, axis=0), np.eye(3), Apparent.none(), confirm=False)
     np.testing.assert_allclose(shift_px(found.apparent), [0.0, 2.0], atol=0.2)

@@ -13,10 +13,10 @@ from core.solve import solve
 from core.texture import LEAST_PATCHES
 from tests import exact_scene as scene
 
-# Of the edges of the strips and of the patches between them; the ground is seen without noise.
+# Of the edges of the strips and of the patches about them; the ground is seen without noise.
 STRIP_NOISE_PX, PATCH_NOISE_PX = 0.06, 0.02
 # Patches lie on a roof below the strips, some on what stands on it.
-COUNT, LOWEST_M, HIGHEST_M = 50, -1.5, 0.5
+COUNT, LOWEST_M, HIGHEST_M = 50, -1.4, 0.5
 
 
 def places() -> Floats:
@@ -27,7 +27,7 @@ def places() -> Floats:
 
 @lru_cache
 def recording(noise_px: float = PATCH_NOISE_PX, strip_noise_px: float = STRIP_NOISE_PX) -> Recording:
-    """Noisy strips and better patches between them."""
+    """Noisy strips and better patches about them."""
 
     def on_roof(frame: int) -> Floats:
         shift, angle = scene.motion(frame)
@@ -41,7 +41,7 @@ def recording(noise_px: float = PATCH_NOISE_PX, strip_noise_px: float = STRIP_NO
 
 @lru_cache
 def strips(noise_px: float = STRIP_NOISE_PX) -> Recording:
-    """Noisy strips with nothing between them."""
+    """Noisy strips with nothing about them."""
     return replace(scene.recording(noise_px), ground_raw=scene.recording().ground_raw)
 
 
@@ -97,6 +97,31 @@ def test_patches_that_do_not_move_with_the_strips_are_left_out(moving: float) ->
     reference_raw = np.where(others[:, None], raw[0], given.reference.texture_raw["roof"])
     some = with_patches(reference_raw[~others], raw[:, ~others])
     np.testing.assert_allclose(history(with_patches(reference_raw, raw)).p1_m, history(some).p1_m, atol=1e-9)
+
+
+def test_patches_on_a_lower_roof_are_left_out_though_they_move_alike() -> None:
+    given = recording()
+    raw = given.texture_raw["roof"].copy()
+    others = np.arange(COUNT) % 3 == 0
+    for frame in range(scene.FRAMES):
+        shift, _ = scene.motion(frame)
+        flat = places()[others, :2] + scene.ROOF_M + shift
+        raw[frame, others] = scene.seen(frame, np.column_stack([flat, np.full(others.sum(), scene.HEIGHT_M - 2.5)]))
+    reference_raw = np.where(others[:, None], raw[0], given.reference.texture_raw["roof"])
+    solved = solve(with_patches(reference_raw, raw), scene.project_document(), scene.LENS)
+    np.testing.assert_array_equal(solved.targets["roof"].texture_used, ~others)
+
+
+def test_patches_whose_height_nothing_tells_are_left_out() -> None:
+    given = recording()
+    ground, roof, patches = (
+        np.repeat(raw[:1], scene.FRAMES, axis=0)
+        for raw in (given.ground_raw, given.targets_raw["roof"], given.texture_raw["roof"])
+    )
+    noisy = patches + np.random.default_rng(3).normal(scale=PATCH_NOISE_PX, size=patches.shape)
+    still = replace(given, ground_raw=ground, targets_raw={"roof": roof}, texture_raw={"roof": noisy})
+    solved = solve(still, scene.project_document(), scene.LENS)
+    assert not solved.targets["roof"].texture_used.any()
 
 
 def test_few_patches_are_not_listened_to() -> None:

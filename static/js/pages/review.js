@@ -22,6 +22,7 @@ import { segmented } from "../components/segmented.js";
 import { Solver } from "../components/solver.js";
 import { toast, toastError } from "../components/toast.js";
 
+/** @typedef {import("../lib/types.js").Point} Point */
 /** @typedef {import("../components/histories.js").History} History */
 /** @typedef {import("../components/histories.js").Method} Method */
 /** @typedef {import("../components/review-overlay.js").Layer} Layer */
@@ -465,16 +466,26 @@ function showFacts() {
       h("dd", {}, `${fixed(main.time_s[i], 3)} s`),
       h("dt", {}, "Rotation"),
       h("dd", {}, turn === null || turn === undefined ? "–" : `${fixed(turn * 1000, 2)} mrad`),
-      stage === "scene" ? null : [h("dt", {}, "Ground"), h("dd", {}, groundWords(i))],
+      stage === "scene" ? null : featureRows(i),
     ),
   );
 }
 
-/** What is known of the ground in a frame: known only where the frame is looked at. @param {number} frame */
-function groundWords(frame) {
-  const ground = view.review?.frame === frame ? view.review.ground : null;
-  if (ground) return `${plural(ground.used.length, "feature")} used, ${count(ground.rejected.length)} rejected`;
-  return view.isShown(frame) ? "–" : "…";
+/** What took part in a frame and what did not: known only where the frame is looked at. @param {number} frame */
+function featureRows(frame) {
+  const review = view.review?.frame === frame ? view.review : null;
+  /** @param {{used: Point[], rejected: Point[]} | undefined} found @param {[one: string, many: string]} name */
+  const words = (found, [one, many]) => {
+    if (!found) return view.isShown(frame) ? "–" : "…";
+    if (found.used.length + found.rejected.length === 0) return "none";
+    return `${plural(found.used.length, one, many)} used, ${count(found.rejected.length)} rejected`;
+  };
+  return [
+    h("dt", {}, "Ground"),
+    h("dd", {}, words(review?.ground, ["feature", "features"])),
+    h("dt", {}, "Target"),
+    h("dd", {}, words(review?.targets[target]?.points_raw, ["patch", "patches"])),
+  ];
 }
 
 /** @param {History} history @param {number} i @param {"p1" | "p2"} point @param {"dx" | "dy"} axis */
