@@ -31,13 +31,15 @@ MOST_RELIEF_M = 1.5
 KNOWN_RELIEF_M = 0.2
 # What is left of a patch in a frame counts as an outlier beyond so many standard deviations.
 OUTLYING = 5.0
-# A patch that departs from the strips' motion by so many times what a place of theirs does shows something else.
-MOST_SCATTER = 4.0
+# A patch that departs from the strips' motion by so many times what a place of theirs does shows something else, and
+# none is credibly so many times better than they.
+MOST_SCATTER = 2.5
+LEAST_SCATTER = 0.25
 # A patch must be seen in this part of the frames in which the lines are.
 LEAST_SEEN = 0.5
-# Neighbouring places of a strip share blocks of the compression and err alike, so that a patch tells as much as two of
-# them (measured on H.264 clips; between one and four the error hardly changes).
-PLACES_PER_PATCH = 2.0
+# Neighbouring places of a strip share blocks of the compression and err alike, so that a patch that scatters as much
+# tells as much as three of them (measured on H.264 clips; from two to five the error changes by a thirtieth).
+PLACES_PER_PATCH = 3.0
 
 
 def with_texture(
@@ -74,13 +76,17 @@ def with_texture(
     near = (np.abs(z - z_m) < MOST_RELIEF_M) & (sigma_m < KNOWN_RELIEF_M)
     left = patches.left_over(z, lines, body.centre)
     lasting = _lasting(left)
-    belonging = near & _belonging(left - lasting, lines, known)
+    scatter, of_places = _scatter(left - lasting), float(np.median(finite_median(lines.sigma[known])))
+    seen = finite_rows(left).sum(axis=0) >= LEAST_SEEN * known.sum()
+    belonging = near & seen & (scatter < MOST_SCATTER * of_places)
     if belonging.sum() < LEAST_PATCHES:
         return lines, np.zeros_like(belonging)
     texture = RestBody(None, patches.at_rest(z)[belonging], None, body.centre, body.places)
     motion = texture.fit((patches.places(z) - lasting)[:, belonging], np.zeros(len(known), dtype=np.bool_))
     enough = (motion.weight > 0.1).sum(axis=1) >= LEAST_PATCHES
-    return combined_fit(lines, motion, np.where(enough, PLACES_PER_PATCH, 0.0)), belonging
+    typical = max(float(np.median(scatter[belonging])), LEAST_SCATTER * of_places)
+    worth = PLACES_PER_PATCH * (of_places / typical) ** 2
+    return combined_fit(lines, motion, np.where(enough, worth, 0.0)), belonging
 
 
 @dataclass(frozen=True)
@@ -137,10 +143,3 @@ def _lasting(left: Floats) -> Floats:
 def _scatter(left: Floats) -> Floats:
     """Return the standard deviation (N,) along an axis of what patches leave over (F, N, 2) in all frames."""
     return robust_sigma(np.moveaxis(left, 0, -1).reshape(left.shape[1], -1))
-
-
-def _belonging(left: Floats, lines: RigidFit, known: Bools) -> Bools:
-    """Return which patches (N,) move with the lines, as what they leave over from frame to frame (F, N, 2) tells."""
-    seen = finite_rows(left).sum(axis=0) >= LEAST_SEEN * known.sum()
-    usual = float(np.median(finite_median(lines.sigma[known])))
-    return np.asarray(seen & (_scatter(left) < MOST_SCATTER * usual), dtype=np.bool_)
