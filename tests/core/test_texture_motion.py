@@ -72,6 +72,13 @@ def test_patches_at_any_height_halve_the_noise_of_strips() -> None:
     assert (both < 0.6 * alone).all()
 
 
+def test_patches_that_scatter_more_than_strips_help_as_much_as_they_know() -> None:
+    alone = rms_m(history(strips()))
+    both = rms_m(history(recording(noise_px=0.09)))
+    # Believed as if they were as good as strips, they would drown these, and nothing would be gained along x.
+    assert (both < 0.96 * alone).all()
+
+
 def test_standard_deviations_follow() -> None:
     found = history(recording(noise_px=0.05))
     scatter = error_m(found)[:44].std(axis=0)
