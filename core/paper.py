@@ -47,6 +47,9 @@ WINDOWS_PX = (10, 12, 14, 16, 18, 20)
 WINDOW_BY_SIZE = 5.0
 # Windows are laid out in squares of about this side, pixels: what SIFT makes of one stays near the processor.
 MOSAIC_PX = 160
+# The reference frame is searched for features in tiles of this side, and so far beyond them as small features depend on
+# pixels: of a whole 4K frame SIFT takes two gigabytes.
+TILE_PX, BEYOND_TILE_PX = 1024, 64
 # How far from its expected place a match may lie, pixels.
 NEAR_PX = 4.0
 # Difference of two descriptors beyond which they show different places, out of 512.
@@ -145,7 +148,7 @@ class SiftGround:
 
     def __init__(self, luma: Luma, lens: Lens, allowed: NDArray[np.bool_]) -> None:
         self._lens = lens
-        keypoints, descriptors = _sift().detectAndCompute(luma, allowed.astype(np.uint8))
+        keypoints, descriptors = _features_by_tiles(luma, allowed.astype(np.uint8))
         kept = _spread_strongest(keypoints, luma.shape, FEATURES)
         if len(kept) < LEAST_MATCHES:
             raise InputError(
@@ -254,6 +257,25 @@ def _two_least(number: NDArray[np.int64], value: NDArray[np.float32]) -> tuple[N
 
 def _sift() -> cv2.SIFT:
     return cv2.SIFT.create(nfeatures=0, contrastThreshold=0.02)
+
+
+def _features_by_tiles(luma: Luma, allowed: Luma) -> tuple[list[cv2.KeyPoint], NDArray[np.float32]]:
+    """Return the SIFT features of a frame wherever a mask of its size is not zero, and their descriptors (N, 128)."""
+    keypoints: list[cv2.KeyPoint] = []
+    descriptors = [np.empty((0, 128), dtype=np.float32)]
+    for top, left in itertools.product(*(range(0, side, TILE_PX) for side in luma.shape)):
+        first_row, first_column = max(0, top - BEYOND_TILE_PX), max(0, left - BEYOND_TILE_PX)
+        reach = TILE_PX + BEYOND_TILE_PX
+        within = np.zeros_like(allowed)
+        within[top : top + TILE_PX, left : left + TILE_PX] = allowed[top : top + TILE_PX, left : left + TILE_PX]
+        part = slice(first_row, top + reach), slice(first_column, left + reach)
+        found, described = _sift().detectAndCompute(luma[part], within[part])
+        for keypoint in found:
+            keypoint.pt = keypoint.pt[0] + first_column, keypoint.pt[1] + first_row
+        if found:
+            keypoints.extend(found)
+            descriptors.append(np.asarray(described, dtype=np.float32))
+    return keypoints, np.concatenate(descriptors)
 
 
 def _spread_strongest(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...], count: int) -> list[int]:

@@ -58,7 +58,7 @@ TRIES = 3
 LONGEST_WAIT_S = 60
 EMPTY_TASKS = 500
 # Frames measured by the engine's `paper` for each one measured as the paper's text reads.
-PAPER_BY_PUBLISHED = 5
+PAPER_BY_PUBLISHED = 15
 BIT_RATE_4K = {"libx264": 45_000_000, "libx265": 30_000_000}
 PIXELS_4K = 3840 * 2160
 

@@ -40,6 +40,27 @@ def test_a_band_without_a_strip_has_no_edges() -> None:
     assert not np.isfinite(paper.canny_pairs(np.full((36, 60), 120, np.uint8))).any()
 
 
+def test_features_are_found_tile_by_tile_as_in_the_whole_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    luma = ground_picture(3)
+    allowed = np.ones(luma.shape, np.uint8)
+    allowed[200:400, 300:600] = 0
+    monkeypatch.setattr(paper, "TILE_PX", 256)
+    tiled, described = paper._features_by_tiles(luma, allowed)
+    whole, described_whole = paper._sift().detectAndCompute(luma, allowed)
+    small, small_whole = (
+        {
+            (round(each.pt[0], 1), round(each.pt[1], 1), round(each.angle)): place
+            for place, each in enumerate(features)
+            if each.size < paper.LARGEST_SIZE_PX
+        }
+        for features in (tiled, whole)
+    )
+    both = sorted(set(small) & set(small_whole))
+    assert len(both) > 0.99 * max(len(small), len(small_whole)) > 300
+    ours, theirs = described[[small[key] for key in both]], described_whole[[small_whole[key] for key in both]]
+    assert np.median(np.abs(ours - theirs).max(axis=1)) < 1.0
+
+
 def test_windows_find_the_matches_that_the_whole_frame_gives(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paper, "FEATURES", COUNT)
     luma = ground_picture(1)
