@@ -24,8 +24,8 @@ from core.texture import LEAST_PATCHES
 # How far from the strips' plane patches lie where nothing tells, one standard deviation, metres.
 RELIEF_SIGMA_M = 0.5
 RELIEF_ROUNDS = 2
-# A patch takes part where it is known to be no further from the strips' plane than this, in metres: it may lie on a
-# lower roof or on the ground else, which moves as little as the roof in weak shaking.
+# A patch takes part where it is known to be no further from the strips' plane than this, metres. Others may lie on a
+# lower storey or on the ground, whose motion differs too little from the roof's in weak shaking to tell them apart.
 MOST_RELIEF_M = 1.5
 # One standard deviation of a height that counts as known, metres.
 KNOWN_RELIEF_M = 0.2

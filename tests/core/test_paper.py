@@ -10,6 +10,7 @@ from tests import exact_scene as scene
 
 SIZE = (1000, 750)
 COUNT = 150
+SIFT = paper._sift()
 
 
 def ground_picture(seed: int) -> np.ndarray:
@@ -44,9 +45,20 @@ def test_features_are_found_tile_by_tile_as_in_the_whole_frame(monkeypatch: pyte
     luma = ground_picture(3)
     allowed = np.ones(luma.shape, np.uint8)
     allowed[200:400, 300:600] = 0
-    monkeypatch.setattr(paper, "TILE_PX", 256)
-    tiled, described = paper._features_by_tiles(luma, allowed)
     whole, described_whole = paper._sift().detectAndCompute(luma, allowed)
+    looked_at: list[int] = []
+
+    class Sift:
+        """What memory goes by is how large a picture it is given."""
+
+        def detectAndCompute(self, picture: np.ndarray, mask: np.ndarray) -> tuple[list[cv2.KeyPoint], np.ndarray]:
+            looked_at.append(max(picture.shape))
+            return SIFT.detectAndCompute(picture, mask)
+
+    monkeypatch.setattr(paper, "TILE_PX", 256)
+    monkeypatch.setattr(paper, "_sift", Sift)
+    tiled, described = paper._features_by_tiles(luma, allowed)
+    assert max(looked_at) == 256 + 2 * paper.BEYOND_TILE_PX
     small, small_whole = (
         {
             (round(each.pt[0], 1), round(each.pt[1], 1), round(each.angle)): place
