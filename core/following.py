@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.apparent import Apparent
-from core.coordinates import Floats, apply_homography, finite_rows
+from core.coordinates import Floats, apply_homography, finite_rows, rotation_2d
 from core.errors import InputError
 from core.ground import ALIKE_SCORE, NOISY_ROUNDS, Regions, View, choose_features_within
 from core.lens import Lens
@@ -275,8 +275,8 @@ class LinesFollower:
 
 def _about(luma: Luma, ends_raw: Floats, moving_regions_px: Regions) -> Floats:
     """Return patches (M, 2) of what lies about lines with ends (3, 2, 2), raw pixels; none where it is plain."""
-    u, v = (ends_raw[0, 1] - ends_raw[0, 0]) / np.linalg.norm(ends_raw[0, 1] - ends_raw[0, 0])
-    along_l1 = np.array([[u, v], [-v, u]])
+    u, v = ends_raw[0, 1] - ends_raw[0, 0]
+    along_l1 = rotation_2d(-float(np.arctan2(v, u)))
     places = ends_raw.reshape(-1, 2) @ along_l1.T
     low, high = places.min(axis=0), places.max(axis=0)
     corners = (low + high) / 2 + REACH_OF_LINES * (high - low) / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])

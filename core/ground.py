@@ -12,7 +12,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from core.coordinates import Bools, Floats, apply_homography, finite_rows, homography_jacobian, invert_2x2
 from core.errors import InputError
@@ -118,13 +118,9 @@ def choose_features_within(luma: Luma, region_raw: Floats, count: int, *, bounds
     if (high - low < 2 * reach).any():
         return np.empty((0, 2))
     box = luma[low[1] : high[1], low[0] : high[0]]
-    region: Luma = np.zeros(box.shape, dtype=np.uint8)
-    cv2.fillPoly(region, [corners - low.astype(np.int32)], 1)
+    region = _covered(box.shape, [corners - low])
     if bounds:
-        within = np.zeros_like(region)
-        for bound in bounds:
-            cv2.fillPoly(within, [(np.rint(np.array(bound)) - low).astype(np.int32)], 1)
-        region &= within
+        region &= _covered(box.shape, [np.array(bound) - low for bound in bounds])
     inside = cv2.erode(region, np.ones((2 * HALF_PX + 1, 2 * HALF_PX + 1), np.uint8)).astype(bool)
     return _spread_corners(box, inside & ground_mask(box.shape, ()), count, factor=_choosing_factor(luma)) + low
 
@@ -166,13 +162,19 @@ def _spread_corners(luma: Luma, allowed: NDArray[np.bool_], count: int, *, facto
 
 def ground_mask(shape: tuple[int, ...], moving_regions_px: Regions) -> NDArray[np.bool_]:
     """Return the (height, width) mask of raw pixels whose patches lie inside the frame and outside what moves."""
-    mask: Luma = np.ones(shape[:2], dtype=np.uint8)
-    for region in moving_regions_px:
-        cv2.fillPoly(mask, [np.rint(np.array(region)).astype(np.int32)], 0)
+    mask = 1 - _covered(shape[:2], moving_regions_px)
     reach = HALF_PX + MARGIN_PX + 2
     framed = cv2.copyMakeBorder(mask, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
     kept = cv2.erode(framed, np.ones((2 * reach - 1, 2 * reach - 1), np.uint8))
     return np.asarray(kept[1:-1, 1:-1] > 0, dtype=np.bool_)
+
+
+def _covered(shape: tuple[int, ...], polygons: Iterable[ArrayLike]) -> Luma:
+    """Return the mask (height, width) of pixels that polygons of pixels cover."""
+    mask: Luma = np.zeros(shape, dtype=np.uint8)
+    for polygon in polygons:
+        cv2.fillPoly(mask, [np.rint(np.asarray(polygon)).astype(np.int32)], 1)
+    return mask
 
 
 def _best_of_cells(quality: NDArray[np.float32], cell: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

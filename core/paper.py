@@ -227,8 +227,9 @@ class SiftGround:
 
     def _mosaics(self, luma: Luma, expected_raw: Floats) -> Iterator[_Mosaic]:
         """Return the windows around expected features that lie in the frame, those of one size side by side."""
+        middles = np.rint(np.nan_to_num(expected_raw, nan=-1e6)).astype(np.int64)
         for half in WINDOWS_PX:
-            corners = np.rint(np.nan_to_num(expected_raw, nan=-1e6)).astype(np.int64) - half
+            corners = middles - half
             inside = (corners >= 0).all(axis=1) & (corners + 2 * half <= np.array(luma.shape[::-1])).all(axis=1)
             numbers = np.flatnonzero(inside & (self._half_px == half))
             together = (MOSAIC_PX // (2 * half)) ** 2

@@ -141,7 +141,7 @@ def test_without_lines_nothing_is_looked_for_about_them() -> None:
     assert np.isnan(found.texture_raw).all()
 
 
-def test_about_lines_that_leave_little_room_nothing_is_followed() -> None:
+def test_where_what_moves_leaves_little_room_nothing_is_followed_about_lines() -> None:
     lines = follower([[(235.0, 150.0), (265.0, 150.0), (265.0, 180.0), (235.0, 180.0)]])
     assert lines.reference_texture_raw.shape == (0, 2)
     found = lines.find(np.roll(roof(), 2, axis=0), np.eye(3), Apparent.none(), confirm=False)
