@@ -262,8 +262,7 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
         "--workers",
         type=_positive_number,
         metavar="N",
-        help="measure in up to N processes at once, as many as cores and the clip's length repay; without it, as many "
-        "as gain much, up to four",
+        help="measure in up to N processes at once, as many as cores and the clip's length repay; four without it",
     )
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="measure on the workers of this Dask scheduler (rooftrack[cluster])"

@@ -22,15 +22,16 @@ WARM_UP = 8
 LEAST_FRAMES = 30
 # Frames that a process measures while those that help it are still loading.
 HEAD_START = 18
-# One process keeps two cores busy, decoding and measuring. Others repay their start by so many frames; where they find
-# no idle cores they gain little, and it takes more.
+# One process keeps two cores busy, decoding and measuring; a second on cores of its own repays its start by so many
+# frames.
 CORES_EACH = 2
-REPAYING_FRAMES_IDLE = 60
-REPAYING_FRAMES = 500
+REPAYING_FRAMES = 60
 # Frames of so many pixels, full HD, are decoded more quickly than measured, which a process does on one core. Processes
-# that share cores then take 0.8 of the time of one; at 4K they save nothing and take twice the memory.
+# that share cores then take 0.83 of the time of one, and repay their start by more frames; at 4K they save nothing,
+# rather the contrary, and take twice the memory.
 LIGHT_PIXELS = 2_100_000
-# So many processes are started unasked: each takes half a gigabyte at 4K, and more would wait for the decoder's cores.
+REPAYING_FRAMES_SHARING = 500
+# So many processes are started unasked: each takes half a gigabyte at 4K.
 USUAL_PROCESSES = 4
 
 
@@ -46,14 +47,12 @@ def processes_for(frames: int, workers: int | None, cores: int, *, pixels: int) 
     """Return how many of `workers` processes measure so many frames in the shortest time.
 
     Args:
-        workers: None where nobody asked for several; they then are few, and share cores only where that gains much.
+        workers: None where nobody said how many there may be.
         pixels: of a frame.
     """
-    idle, sharing = min(cores // CORES_EACH, frames // REPAYING_FRAMES_IDLE), frames // REPAYING_FRAMES
-    if workers is None:
-        workers = min(USUAL_PROCESSES, cores)
-        sharing = sharing if pixels <= LIGHT_PIXELS else 1
-    return min(workers, max(1, idle, sharing))
+    apart = min(cores // CORES_EACH, frames // REPAYING_FRAMES)
+    sharing = min(cores, frames // REPAYING_FRAMES_SHARING) if pixels <= LIGHT_PIXELS else 1
+    return min(workers or USUAL_PROCESSES, max(1, apart, sharing))
 
 
 def missing_chunks(done: Sequence[int], index: FrameIndex, parts: int, head_start: int = 0) -> list[Chunk]:

@@ -212,8 +212,8 @@ def measure(
     """Measure what is still missing of a video, resuming where an earlier run stopped; return the recording's number.
 
     Args:
-        workers: processes on this machine at most, this one among them: as many as its cores keep busy and the clip's
-            length repays; None for as many as that without being asked.
+        workers: processes on this machine at most, this one among them: as many as its cores and the clip's length
+            repay; None for four at most.
         scheduler: address of a Dask scheduler whose workers measure instead.
         fresh: forget what was measured before.
 

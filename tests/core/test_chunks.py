@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from core.chunks import LEAST_FRAMES, REPAYING_FRAMES, WARM_UP, Chunk, missing_chunks, processes_for
+from core.chunks import LEAST_FRAMES, REPAYING_FRAMES_SHARING, WARM_UP, Chunk, missing_chunks, processes_for
 from core.cluster import MOST_TASK_FRAMES, longest_first, tasks_for
 from core.video import FrameIndex
 
@@ -65,8 +65,8 @@ HD, UHD = 1920 * 1080, 3840 * 2160
     ("frames", "workers", "cores", "pixels", "processes"),
     [
         (300, 2, 2, UHD, 1),
-        (2 * REPAYING_FRAMES, 2, 2, UHD, 2),
-        (2 * REPAYING_FRAMES, 8, 2, UHD, 2),
+        (10_000, 2, 2, UHD, 1),
+        (10_000, 8, 4, UHD, 2),
         (300, 2, 4, UHD, 2),
         (400, 8, 8, UHD, 4),
         (120, 8, 8, UHD, 2),
@@ -82,6 +82,9 @@ HD, UHD = 1920 * 1080, 3840 * 2160
         (10_000, None, 2, HD, 2),
         (10_000, None, 1, HD, 1),
         (10_000, None, 4, HD, 4),
+        (2 * REPAYING_FRAMES_SHARING, 8, 4, HD, 2),
+        (10_000, 8, 4, HD, 4),
+        (10_000, 8, 16, HD, 8),
         (10_000, 1, 4, HD, 1),
     ],
 )
