@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Iterator
@@ -74,6 +75,29 @@ def test_pixels_and_marks_lie_where_the_engine_says(browser, project, truth, rat
             page.evaluate("[...document.querySelectorAll('.pane > canvas')].map(c => c.width)")
             == [round(box["width"] * ratio)] * 2
         )
+
+
+def test_numbers_of_pairs_that_lie_close_are_all_legible(browser, project):
+    folder, pages = project
+    file = folder / "project.json"
+    known = json.loads(file.read_text())
+    first, *others = known["correspondences"][:4]
+    # In the whole picture some two of its pixels go to one of the window, and a number is a mark wide.
+    for pair, beside in zip(others, [(30, 0), (0, 40), (30, 45)], strict=True):
+        pair["frame_px"] = [first["frame_px"][axis] + beside[axis] for axis in (0, 1)]
+    known["correspondences"] = [first, *others]
+    file.write_text(json.dumps(known))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        fitted(page, pane(page, "Reference frame"), FRAME_SIZE)
+        numbers = pane(page, "Reference frame").locator(".shapes .mark text")
+        expect(numbers).to_have_count(4)
+        boxes = [number.bounding_box() for number in numbers.all()]
+        for one, other in itertools.combinations(boxes, 2):
+            apart_x = max(one["x"], other["x"]) - min(one["x"] + one["width"], other["x"] + other["width"])
+            apart_y = max(one["y"], other["y"]) - min(one["y"] + one["height"], other["y"] + other["height"])
+            assert max(apart_x, apart_y) > -1
 
 
 def test_an_edit_is_undone_after_a_reload(browser, project):

@@ -16,8 +16,20 @@ import { distance, distanceToSegment, isInside } from "../lib/coordinates.js";
  * @property {boolean} [grab]  can be selected and dragged; polygons also by their inside
  */
 
+/** @typedef {{x: number, y: number, anchor: "start" | "end"}} LabelPlace  CSS px: one end of the text's base line */
+/** @typedef {{left: number, top: number, right: number, bottom: number}} Box  CSS px */
+
 const GRAB_RADIUS = { mark: 14, handle: 13, aim: 0, arrow: 0, polyline: 8, polygon: 7 };
 const MARK = "M-11 0H-3.5M3.5 0H11M0-11V-3.5M0 3.5V11M6.5 0a6.5 6.5 0 1 1-13 0 6.5 6.5 0 1 1 13 0";
+const MARK_RADIUS = 11;
+/** Where the label of a mark may stand, from its middle; the first that covers nothing is taken. @type {LabelPlace[]} */
+const BESIDE_MARK = [
+  { x: 10, y: -9, anchor: "start" },
+  { x: 10, y: 18, anchor: "start" },
+  { x: -10, y: -9, anchor: "end" },
+  { x: -10, y: 18, anchor: "end" },
+];
+const LETTER = { width: 7.5, height: 11 }; // CSS px, about
 const AIM = "M-16 0H-5M5 0H16M0-16V-5M0 5V16";
 const HANDLE = "M4.5 0a4.5 4.5 0 1 1-9 0 4.5 4.5 0 1 1 9 0";
 const HANDLE_CORE = "M2.5 0a2.5 2.5 0 1 1-5 0 2.5 2.5 0 1 1 5 0";
@@ -47,8 +59,9 @@ export class ShapeLayer {
       this.#drawn.delete(id);
     }
     let next = this.element.firstElementChild;
+    const labels = labelsBesideMarks(shapes, view);
     for (const shape of shapes) {
-      this.#place(shape, view, shape.id === hot);
+      this.#place(shape, view, shape.id === hot, labels.get(shape.id) ?? BESIDE_MARK[0]);
       const { group } = this.#parts(shape.id);
       if (group === next) next = next.nextElementSibling;
       else this.element.insertBefore(group, next); // later shapes lie on top, whichever was made first
@@ -69,8 +82,8 @@ export class ShapeLayer {
     return parts;
   }
 
-  /** @param {Shape} shape @param {View} view @param {boolean} hot */
-  #place(shape, view, hot) {
+  /** @param {Shape} shape @param {View} view @param {boolean} hot @param {LabelPlace} label  of a shape at one point */
+  #place(shape, view, hot, label) {
     const { group, halo, ink, text } = this.#parts(shape.id);
     const outline = OUTLINES[shape.kind];
     const isPoint = outline !== undefined;
@@ -88,9 +101,44 @@ export class ShapeLayer {
       ink.setAttribute("d", path);
     }
     if (text.textContent !== (shape.label ?? "")) text.textContent = shape.label ?? "";
-    decorate(text, isPoint ? { x: 10, y: -9 } : { x: (canvas[0]?.[0] ?? 0) + 8, y: (canvas[0]?.[1] ?? 0) - 8 });
+    const { x, y, anchor } = isPoint ? label : { x: (canvas[0]?.[0] ?? 0) + 8, y: (canvas[0]?.[1] ?? 0) - 8, anchor: "start" };
+    decorate(text, { x, y, "text-anchor": anchor });
   }
 }
+
+/** Where labels of marks cover neither each other nor other marks, as far as there is room. @param {Shape[]} shapes @param {View} view @returns {Map<string, LabelPlace>} */
+function labelsBesideMarks(shapes, view) {
+  const marks = shapes
+    .filter(({ kind }) => kind === "mark")
+    .map((shape) => ({ shape, at: view.toCanvas(shape.points[0]), isChosen: /\bselected\b/.test(shape.class ?? "") }));
+  /** @type {{owner: Shape, box: Box}[]} */
+  const taken = marks.map(({ shape, at: [x, y] }) => ({
+    owner: shape,
+    box: { left: x - MARK_RADIUS, right: x + MARK_RADIUS, top: y - MARK_RADIUS, bottom: y + MARK_RADIUS },
+  }));
+  /** @type {Map<string, LabelPlace>} */
+  const places = new Map();
+  for (const { shape, at } of marks.sort((a, b) => Number(b.isChosen) - Number(a.isChosen))) {
+    const width = LETTER.width * (shape.label ?? "").length;
+    const free = BESIDE_MARK.find((place) => {
+      const box = labelBox(at, place, width);
+      return !taken.some((one) => one.owner !== shape && overlap(one.box, box));
+    });
+    const place = free ?? BESIDE_MARK[0];
+    places.set(shape.id, place);
+    taken.push({ owner: shape, box: labelBox(at, place, width) });
+  }
+  return places;
+}
+
+/** @param {Point} mark @param {LabelPlace} place @param {number} width @returns {Box} */
+function labelBox([u, v], { x, y, anchor }, width) {
+  const left = u + x - (anchor === "end" ? width : 0);
+  return { left, right: left + width, top: v + y - LETTER.height, bottom: v + y };
+}
+
+/** @param {Box} a @param {Box} b */
+const overlap = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
 
 /** The shape a pointer would grab: points before lines before insides, nearest first. @param {Shape[]} shapes @param {View} view @param {Point} canvas @param {number} [generosity] times as far as a mouse */
 export function shapeAt(shapes, view, canvas, generosity = 1) {
