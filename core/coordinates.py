@@ -91,7 +91,7 @@ def batches(count: int, size: int) -> Iterator[slice]:
 
 def evenly_spread(count: int, most: int) -> NDArray[np.int64]:
     """Return at most `most` of the numbers below `count`, ascending and evenly spread, both ends included."""
-    return np.unique(np.linspace(0, count - 1, most).astype(np.int64))
+    return np.unique(np.linspace(0, count - 1, most).astype(np.int64)) if count > 0 else np.empty(0, dtype=np.int64)
 
 
 def rotation_2d(angle_rad: float) -> Floats:

@@ -33,6 +33,8 @@ MOST_FRAMES = 1500
 # Beyond this many standard deviations of its frame, a pose is trusted less instead of followed.
 OUTLYING = 3.5
 LEAST_FRAMES = 24
+# A record must hold so many of the runs that are left out, or none of them has neighbours on both sides.
+LEAST_RUNS = 3
 # Least misfit of a frame, as part of the usual one: that the reference frame fits itself says nothing about its pose.
 LEAST_MISFIT = 0.6
 # A pose's error grows with the misfit of its points, and faster where their errors are alike; more is not credible.
@@ -88,7 +90,7 @@ def smooth_flight(time_s: Floats, centre_m: Floats, misfit_px: Floats) -> Smooth
             from the record: compressed video has runs of frames several times worse than their neighbours.
     """
     seen = np.isfinite(centre_m).all(axis=1) & (misfit_px > 0)
-    if seen.sum() < LEAST_FRAMES:
+    if seen.sum() < LEAST_FRAMES or np.ptp(time_s[seen]) < LEAST_RUNS * RUN_S:
         return None
     moments, centre = time_s[seen], centre_m[seen]
     relative = np.maximum(misfit_px[seen] / float(np.median(misfit_px[seen])), LEAST_MISFIT)

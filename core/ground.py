@@ -91,13 +91,16 @@ class ExpectedFeatures:
         return np.asarray(self.rays + (invert_2x2(self.J_raw_rays) @ (raw - self.raw)[..., None])[..., 0])
 
 
-def choose_features(luma: Luma, moving_regions_px: Regions, count: int) -> Floats:
+def choose_features(luma: Luma, moving_regions_px: Regions, count: int, lens: Lens) -> Floats:
     """Return about `count` corners (N, 2) of the reference frame, raw pixels, evenly spread outside the regions.
+
+    Where the lens model ends within the frame, none are beyond its end.
 
     Raises:
         InputError: too little of the ground is left to hold on to.
     """
     points = _spread_corners(luma, ground_mask(luma.shape, moving_regions_px), count, factor=_choosing_factor(luma))
+    points = points[finite_rows(lens.rays_from_raw(points))]
     if len(points) < LEAST_POINTS:
         raise InputError(
             f"project.json: moving_regions_px leave only {len(points)} ground features in the reference frame; "

@@ -105,7 +105,10 @@ class GeometricMeasurer:
     """
 
     def __init__(self, luma: Luma, setup: MeasureSetup, reference: Reference | None = None) -> None:
-        points = choose_features(luma, setup.moving_regions_px, FEATURES) if reference is None else reference.ground_raw
+        if reference is None:
+            points = choose_features(luma, setup.moving_regions_px, FEATURES, setup.lens)
+        else:
+            points = reference.ground_raw
         allowed = ground_mask(luma.shape, setup.moving_regions_px)
         self._ground = GroundTracker(luma, points, setup.lens, allowed)
         self._followers = {

@@ -131,11 +131,13 @@ class PatchTracker:
 
         Noise of the reference passes for fine texture, which makes steps too short: all patches alike would stay near
         where they were predicted, and the camera with them. Frames of the first half of the views, whose own noise is
-        in their mean, are compared with that of the others.
+        in their mean, are compared with that of the others. Without a view that shows a patch all stays as it is.
 
         Args:
             views: of the frames after the reference frame in turn; see `views`.
         """
+        if not any(np.isfinite(view).any() for view in views):
+            return
         middle, reference = len(views) // 2, self._tiles[0].astype(np.float32)
         first, second = [reference, *views[: middle - VIEWS_BETWEEN // 2]], views[middle + VIEWS_BETWEEN // 2 :]
         likeness = np.nanmedian([_correlation(reference, view) for view in views])

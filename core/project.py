@@ -341,5 +341,6 @@ def write_project(folder: Path, project: Project) -> None:
 def project_json(project: Project) -> str:
     """Return the file's text: short lists on one line, so that a person can read and edit it."""
     text = json.dumps(project.model_dump(mode="json"), indent=2, ensure_ascii=False)
-    flat_list = re.compile(r"\[\s+((?:[^\[\]{}\"]|\"[^\"]*\")*?)\s+\]")
-    return flat_list.sub(lambda found: "[" + re.sub(r"\s*\n\s*", " ", found.group(1)) + "]", text) + "\n"
+    # Only the layout breaks lines; within strings a break is written as an escape.
+    flat_list = re.compile(r'\[\n\s*((?:[^\[\]{}"]|"(?:[^"\\]|\\.)*")*?)\n\s*\]')
+    return flat_list.sub(lambda found: "[" + re.sub(r"\n\s*", " ", found.group(1)) + "]", text) + "\n"

@@ -99,6 +99,11 @@ class Solution:
     warnings: tuple[str, ...]
 
 
+def excluded_by(project: Project, recording: Recording) -> Bools:
+    """Return which frames (F,) of a recording a person has rejected."""
+    return np.array([project.is_excluded(int(frame)) for frame in recording.frame], dtype=np.bool_)
+
+
 def frame_status(
     recording: Recording, project: Project, ground: Ground, *, points_used: NDArray[np.int64], determined: Bools
 ) -> NDArray[np.str_]:
@@ -112,7 +117,7 @@ def frame_status(
     usual_ground = np.median(ground.inliers[measured]) if measured.any() else 0
     usual_points = np.median(points_used[measured]) if measured.any() else 0
     few = (ground.inliers < 0.5 * usual_ground) | (points_used < 0.7 * usual_points)
-    excluded = np.array([project.is_excluded(int(frame)) for frame in recording.frame], dtype=bool)
+    excluded = excluded_by(project, recording)
     status = np.where(few, Status.WEAK.value, Status.OK.value)
     status = np.where(measured & (points_used >= 0.15 * usual_points), status, Status.LOST.value)
     return np.asarray(np.where(excluded, Status.EXCLUDED.value, status), dtype=np.str_)

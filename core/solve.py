@@ -17,7 +17,7 @@ from core.project import Drift, Intervals, Project, Target
 from core.relief import Relief
 from core.repeats import repeated_pictures, repeats_sentence, without_pictures
 from core.results import TargetHistory, relative_history
-from core.solution import Solution
+from core.solution import Solution, excluded_by
 from core.solve_geometric import solve_geometric
 from core.solve_paper import solve_paper
 from core.uncertainty import held_to_scatter
@@ -37,8 +37,8 @@ def solve(
         InputError: the clicks, the lens, a height or the filter do not do.
     """
     repeated = repeated_pictures(recording)
-    if repeated.any():
-        recording = without_pictures(recording, repeated)
+    # What a person has rejected must not tell how the building rests, how the camera flies or what the lens is like.
+    recording = without_pictures(recording, repeated | excluded_by(project, recording))
     if project.method == "paper":
         solution = solve_paper(recording, project, lens, relief, has_lens=has_lens)
     else:

@@ -60,6 +60,12 @@ def test_noise_alike_in_neighbouring_frames_is_told() -> None:
     assert flight.models[0].noise_m == pytest.approx(1e-3 / np.sqrt(1 - 0.25), rel=0.15)
 
 
+@pytest.mark.parametrize(("frames", "rate_hz"), [(50, 240.0), (80, 240.0), (40, 120.0), (26, 60.0)])
+def test_a_fraction_of_a_second_says_nothing_of_the_flight(frames: int, rate_hz: float) -> None:
+    path = noisy(swaying(0.3, 2, frames), 1e-3)[:, None]
+    assert smooth_flight(np.arange(frames) / rate_hz, path, np.full(frames, 0.1)) is None
+
+
 def test_frames_that_fit_badly_count_less() -> None:
     path = swaying(0.3, 5)
     misfit = np.where(np.arange(900) // 15 % 2, 0.1, 0.5)

@@ -62,7 +62,7 @@ def reference() -> Luma:
 
 @lru_cache
 def features() -> Floats:
-    return choose_features(reference(), REGIONS, 80)
+    return choose_features(reference(), REGIONS, 80, LENS)
 
 
 @lru_cache
@@ -106,12 +106,12 @@ def test_features_are_spread_over_the_ground() -> None:
 def test_regions_over_everything_are_refused() -> None:
     everything = [[(0.0, 0.0), (480.0, 0.0), (480.0, 320.0), (0.0, 320.0)]]
     with pytest.raises(InputError, match="moving_regions_px leave only 0 ground features"):
-        choose_features(reference(), everything, 80)
+        choose_features(reference(), everything, 80, LENS)
 
 
 def test_a_blank_reference_frame_is_refused() -> None:
     with pytest.raises(InputError, match="ground features in the reference frame"):
-        choose_features(frame(np.full(SIZE[::-1], 128.0)), REGIONS, 80)
+        choose_features(frame(np.full(SIZE[::-1], 128.0)), REGIONS, 80, LENS)
 
 
 def test_features_within_a_region() -> None:
@@ -200,7 +200,7 @@ def test_a_kick_of_the_camera_leaves_no_patch_on_the_way(kick_px: tuple[int, int
     gravel = np.random.default_rng(6).normal(size=SIZE[::-1])
     still = frame(120 + 40 * cv2.GaussianBlur(gravel, (0, 0), 0.9) / 0.31)
     lens = Lens.ideal(SIZE, 400.0)
-    points = choose_features(still, REGIONS, 80)
+    points = choose_features(still, REGIONS, 80, LENS)
     tracker = GroundTracker(still, points, lens, ground_mask(SIZE[::-1], REGIONS))
     match = tracker.find(np.roll(still, kick_px[::-1], axis=(0, 1)), np.eye(3))
     assert match is not None

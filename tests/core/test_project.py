@@ -69,6 +69,13 @@ def test_an_edit_makes_a_new_project() -> None:
         project.reference_frame = 3  # type: ignore[misc]
 
 
+@pytest.mark.parametrize("text", ["EQ7 [ test ]", 'a "[ 1 ]" b', "[\n  1\n]", "back\\", "[ ]"])
+def test_what_people_write_is_kept_to_the_letter(text: str) -> None:
+    inputs = {"video": text, "gps": {"file": text, "x": text}}
+    project = Project.model_validate(changed(name=text.replace("\n", " "), inputs=inputs))
+    assert parse_project(project_json(project)) == project
+
+
 def test_excluded_ranges_hold_both_their_ends() -> None:
     project = Project.model_validate(FULL)
     assert [frame for frame in range(15) if project.is_excluded(frame)] == [3, 10, 11, 12]

@@ -19,6 +19,7 @@ from core.project import Project
 from core.relief import Relief
 from core.results import Status, TargetHistory
 from core.solution import Solution
+from core.solve import solve
 from core.solve_geometric import solve_geometric
 from core.uncertainty import LEAST_STILL
 from tests import exact_scene as scene
@@ -508,3 +509,21 @@ def test_a_line_of_which_hardly_anything_is_seen_leaves_its_frame_lost() -> None
     assert np.isnan(history.p1_m[50]).all()
     assert history.status[60] == Status.WEAK
     assert np.abs(error_m(history)[60]).max() < 5e-3
+
+
+@pytest.mark.parametrize("method", ["geometric", "paper"])
+def test_what_a_person_rejected_decides_nothing(method: str) -> None:
+    recording = replace(scene.recording(NOISE_PX), method=method)
+    rejected = slice(5, 31)
+    disturbed = recording.targets_raw["roof"].copy()
+    disturbed[rejected] += np.linspace(0.0, 6.0, 26)[:, None, None, None, None]
+    ground = recording.ground_raw.copy()
+    ground[rejected] += np.random.default_rng(2).normal(scale=0.5, size=ground[rejected].shape)
+    project = scene.project_document(excluded_frames=[(5, 30)], method=method)
+    left, other = (
+        solve(one, project, scene.LENS).histories["roof"]
+        for one in (recording, replace(recording, targets_raw={"roof": disturbed}, ground_raw=ground))
+    )
+    assert set(left.status[rejected]) == {Status.EXCLUDED.value}
+    np.testing.assert_array_equal(other.p1_m, left.p1_m)
+    np.testing.assert_array_equal(other.p1_sigma_m, left.p1_sigma_m)
