@@ -6,6 +6,7 @@ Exit codes: 0 done; 1 with one sentence on standard error; 130 after Ctrl-C, par
 from __future__ import annotations
 
 import argparse
+import io
 import signal
 import sys
 import tempfile
@@ -40,12 +41,14 @@ rooftrack COMMAND --help tells more.
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; return its exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # Better a ? than no word at all where the terminal has no such letter.
+            stream.reconfigure(errors="replace")
     try:
         options = _parser().parse_args(argv)
         command: Callable[[argparse.Namespace], int] = options.command
         return command(options)
-    except InputError as error:
-        return _refused(str(error))
     except (Cancelled, KeyboardInterrupt):
         print("\nStopped.", file=sys.stderr)
         return STOPPED
@@ -53,13 +56,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Whoever read our output has gone: nothing more can be said to them, not even at exit.
         sys.stdout = None
         return 1
-    except OSError as error:
-        return _refused(disk_problem(error))
     except Exception as error:
-        return _refused(_unexpected(error))
+        return _refused(error)
 
 
-def _refused(sentence: str) -> int:
+def _refused(error: Exception) -> int:
+    """Say in a sentence what went wrong."""
+    if isinstance(error, InputError):
+        sentence = str(error)
+    else:
+        sentence = disk_problem(error) if isinstance(error, OSError) else _unexpected(error)
     print("rooftrack: " + " ".join(sentence.split()), file=sys.stderr)
     return 1
 
@@ -99,14 +105,19 @@ def _run(options: argparse.Namespace) -> int:
             progress.close()
             print(f"Stopped; partial results kept in {folder / 'results'}; run again to resume.", file=sys.stderr)
             return STOPPED
-        except InputError as error:
+        except BrokenPipeError:
+            raise
+        except Exception as error:
+            # Whatever is wrong with one project, the others of a campaign are measured.
             progress.close()
             failures += 1
-            _refused(str(error))
+            _refused(error)
             continue
         progress.close()
         print("\n".join(_outcome(summary.summary)))
         print(f"Results: {folder / 'results'}")
+        if cancel.cancelled:
+            return STOPPED
     return 1 if failures else 0
 
 
@@ -142,7 +153,7 @@ def _check(options: argparse.Namespace) -> int:
             print(f"{folder}: ready to run.")
     if with_problems:
         number = "1 project has" if with_problems == 1 else f"{with_problems} projects have"
-        return _refused(f"{number} problems, listed above; correct them and check again.")
+        return _refused(InputError(f"{number} problems, listed above; correct them and check again."))
     return 0
 
 

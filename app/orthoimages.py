@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from app.errors import ApiError
 from app.frames import Fingerprint, Picture, fingerprint, identity, png_of, scaled_to
 from app.sites import read_site
 from app.store import CACHE_FOLDER, ProjectFolder, read_json
@@ -69,7 +70,10 @@ def _is_stale(folder: ProjectFolder, project: Project, grid: OrthoGrid) -> bool:
         return True
     if extent is not None and max(abs(a - b) for a, b in zip(extent, grid.extent_m, strict=True)) > grid.pixel_size_m:
         return True
-    cloud = folder.input_path("cloud", project)
+    try:
+        cloud = folder.input_path("cloud", project)
+    except ApiError:
+        return True
     if cloud is None or not cloud.is_file():
         return True
     return read_origin(folder.results / ORTHOIMAGE_FILE) != origin_of(identity(cloud), settings)

@@ -84,8 +84,7 @@ class SeekingReader:
             self._seek(number)
         assert self._pictures is not None
         for picture in self._pictures:
-            # Which frame a key frame at the very beginning is needs no looking up.
-            at = 0 if number == 0 and picture.key_frame else self.index.number_at(picture.pts)
+            at = 0 if number == 0 and self._begins_with(picture) else self.index.number_at(picture.pts)
             if at is None or at < self._first:
                 continue
             self._next = at + 1
@@ -96,6 +95,11 @@ class SeekingReader:
                 break
         self._close()
         raise InputError(f"{self._video.name}: frame {number} cannot be decoded; export the video again.")
+
+    def _begins_with(self, picture: VideoFrame) -> bool:
+        """Whether a picture is known to be the first without the whole file being looked through."""
+        _, stream = self._opened()
+        return picture.key_frame and picture.pts is not None and picture.pts == stream.start_time
 
     def _may_read_on(self, number: int) -> bool:
         if number < self._next:

@@ -85,17 +85,25 @@ class Cluster:
             divide: cuts what is to be measured into about so many chunks.
             frames: of the video.
         """
-        from distributed import as_completed
+        from distributed import KilledWorker, as_completed
 
         client = self._connection.result()
         chunks = longest_first(divide(tasks_for(frames, sum(client.nthreads().values()))))
-        futures = [client.submit(self._work, prepared, chunk, pure=False, retries=RETRIES) for chunk in chunks]
+        futures = {client.submit(self._work, prepared, chunk, pure=False, retries=RETRIES): chunk for chunk in chunks}
         try:
             # Its loop must be named: this client is nobody's default.
             for future in as_completed(futures, loop=client.loop):
-                yield from future.result()
+                try:
+                    measured = future.result()
+                except KilledWorker:
+                    chunk = futures[future]
+                    raise InputError(
+                        f"one worker after another died measuring frames {chunk.start} to {chunk.stop - 1}; give them "
+                        "more memory, or fewer threads each, and run again."
+                    ) from None
+                yield from measured
         finally:
-            client.cancel(futures)
+            client.cancel(list(futures))
 
 
 def _load(work: ChunkWork) -> None:

@@ -7,6 +7,9 @@ were; each file takes its predecessor's place in one step, the summary last.
 from __future__ import annotations
 
 import dataclasses
+import errno
+import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -46,6 +49,8 @@ from core.validation import GpsComparison, compare_with_gps
 from core.video import VideoInfo, read_frame, video_warnings
 
 SUMMARY_FILE = "summary.json"
+# How the folder begins into which results are written first; one is left over where a run was killed.
+BEING_WRITTEN = ".being-written-"
 FIGURES_FOLDER = "figures"
 # Sharp enough for print at the width of a page, small enough for a report of a few megabytes.
 FIGURE_DPI = 130
@@ -133,20 +138,30 @@ def write_results(folder: Path, results: Results, progress: Progress = silent) -
     return summary
 
 
+def _is_summary(file: Path) -> bool:
+    return file.name == SUMMARY_FILE
+
+
 @contextmanager
 def _all_or_none(folder: Path) -> Iterator[Path]:
-    """Give a place to write into, whose files come into a folder together at the end, or not at all.
+    """Give a place to write into, whose files come into a folder at the end, the summary last, or not at all.
 
     Raises:
         OSError: there is no room for them, or something else is in their place.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    for left_over in folder.glob(f"{BEING_WRITTEN}*"):
+        shutil.rmtree(left_over, ignore_errors=True)
     try:
-        with TemporaryDirectory(prefix=".being-written-", dir=folder) as made:
+        with TemporaryDirectory(prefix=BEING_WRITTEN, dir=folder) as made:
             yield Path(made)
-            for file in [file for file in Path(made).rglob("*") if file.is_file()]:
-                place = folder / file.relative_to(made)
+            files = sorted((file for file in Path(made).rglob("*") if file.is_file()), key=_is_summary)
+            places = [folder / file.relative_to(made) for file in files]
+            for place in places:
                 place.parent.mkdir(exist_ok=True)
+                if place.is_dir():
+                    raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(place))
+            for file, place in zip(files, places, strict=True):
                 file.replace(place)
     except OSError as error:
         if error.errno in DISK_FULL:

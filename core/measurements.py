@@ -11,7 +11,7 @@ import sqlite3
 import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -32,6 +32,10 @@ CREATE TABLE IF NOT EXISTS frames (
     recording INTEGER NOT NULL REFERENCES recordings(id) ON DELETE CASCADE, frame INTEGER NOT NULL,
     time_s REAL NOT NULL, measured BLOB NOT NULL, PRIMARY KEY (recording, frame)) WITHOUT ROWID;
 """
+
+
+# How SQLite's complaints begin where a file's tables are not these.
+_OTHER_TABLES = "no such"
 
 
 @dataclass(frozen=True)
@@ -104,22 +108,25 @@ class MeasurementStore:
     """The open file; one writer at a time.
 
     Raises:
-        InputError: the file exists and is something else; when writing, there is no room for more.
+        InputError: the file exists and is something else, or is damaged where it is read; when writing, there is no
+            room for more.
     """
 
     def __init__(self, file: Path) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
         self._file = file
-        try:
-            self._db = sqlite3.connect(file, timeout=20.0)
-            self._db.execute("PRAGMA foreign_keys = ON")
-            self._db.executescript(_SCHEMA)
-        except sqlite3.OperationalError as error:
-            raise InputError(
-                f"{file}: cannot be opened ({error}); make room for it, or move away what is in its place."
-            ) from None
-        except sqlite3.DatabaseError as error:
-            raise InputError(f"{file}: is not readable ({error}); delete it, it can be measured again.") from None
+        with ExitStack() as opening:
+            try:
+                self._db = opening.enter_context(closing(sqlite3.connect(file, timeout=20.0)))
+                self._db.execute("PRAGMA foreign_keys = ON")
+                self._db.executescript(_SCHEMA)
+            except sqlite3.OperationalError as error:
+                raise InputError(
+                    f"{file}: cannot be opened ({error}); make room for it, or move away what is in its place."
+                ) from None
+            except sqlite3.DatabaseError as error:
+                raise self._damaged(error) from None
+            opening.pop_all()
         self._last_commit = time.monotonic()
 
     def __enter__(self) -> MeasurementStore:
@@ -134,15 +141,47 @@ class MeasurementStore:
         try:
             yield
         except sqlite3.OperationalError as error:
+            if _OTHER_TABLES in str(error):
+                raise self._damaged(error) from None
             raise InputError(
-                f"{self._file}: cannot be written ({error}); make room on its disk and run again, which goes on from "
-                "what is there."
+                f"{self._file}: cannot be written ({error}); see that its folder is still there, make room on its disk "
+                "and run again, which goes on from what is there."
             ) from None
+        except sqlite3.DatabaseError as error:
+            raise self._damaged(error) from None
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.DatabaseError, zlib.error, ValueError) as error:
+            if isinstance(error, sqlite3.OperationalError) and _OTHER_TABLES not in str(error):
+                raise InputError(
+                    f"{self._file}: cannot be read ({error}); see that it is still there, then do it again."
+                ) from None
+            raise self._damaged(error) from None
+
+    def _damaged(self, error: Exception) -> InputError:
+        return InputError(f"{self._file}: is not readable ({error}); delete it, it can be measured again.")
+
+    def require_readable(self) -> None:
+        """See whether the file is whole and its tables are these.
+
+        Raises:
+            InputError: it is not.
+        """
+        with self._reading():
+            (said,) = self._db.execute("PRAGMA quick_check(1)").fetchone()
+            if said != "ok":
+                raise sqlite3.DatabaseError(said)
+            self._db.execute("SELECT id, method, fingerprint, finished, targets, reference FROM recordings LIMIT 0")
+            self._db.execute("SELECT recording, frame, time_s, measured FROM frames LIMIT 0")
 
     def find(self, method: str, fingerprint: str) -> int | None:
         """Return the number of a recording, or None."""
         query = "SELECT id FROM recordings WHERE method = ? AND fingerprint = ?"
-        row = self._db.execute(query, (method, fingerprint)).fetchone()
+        with self._reading():
+            row = self._db.execute(query, (method, fingerprint)).fetchone()
         return None if row is None else int(row[0])
 
     def begin(self, method: str, fingerprint: str, reference: Reference) -> int:
@@ -184,26 +223,31 @@ class MeasurementStore:
 
     def is_finished(self, recording: int) -> bool:
         """Whether the whole video has been measured."""
-        row = self._db.execute("SELECT finished FROM recordings WHERE id = ?", (recording,)).fetchone()
+        with self._reading():
+            row = self._db.execute("SELECT finished FROM recordings WHERE id = ?", (recording,)).fetchone()
         return bool(row and row[0])
 
     def measured_frames(self, recording: int) -> list[int]:
         """Return the numbers of the frames measured so far, ascending."""
-        rows = self._db.execute("SELECT frame FROM frames WHERE recording = ? ORDER BY frame", (recording,))
-        return [int(row[0]) for row in rows]
+        with self._reading():
+            rows = self._db.execute("SELECT frame FROM frames WHERE recording = ? ORDER BY frame", (recording,))
+            return [int(row[0]) for row in rows]
 
     def reference(self, recording: int) -> Reference:
         """Return what the recording looks for."""
         query = "SELECT targets, reference FROM recordings WHERE id = ?"
-        names, blob = self._db.execute(query, (recording,)).fetchone()
-        ground, *by_target = _unpacked(blob)
-        return Reference(ground, *_named(json.loads(names), by_target))
+        with self._reading():
+            names, blob = self._db.execute(query, (recording,)).fetchone()
+            ground, *by_target = _unpacked(blob)
+            return Reference(ground, *_named(json.loads(names), by_target))
 
     def frame(self, recording: int, frame: int) -> FrameMeasurement | None:
         """Return one frame, or None."""
         query = "SELECT frame, time_s, measured FROM frames WHERE recording = ? AND frame = ?"
-        row = self._db.execute(query, (recording, frame)).fetchone()
-        return None if row is None else _measurement(row, list(self.reference(recording).targets_raw))
+        names = list(self.reference(recording).targets_raw)
+        with self._reading():
+            row = self._db.execute(query, (recording, frame)).fetchone()
+            return None if row is None else _measurement(row, names)
 
     def load(self, recording: int, only: Sequence[int] | None = None) -> Recording:
         """Return everything measured so far, or what is measured of some frames only."""
@@ -213,9 +257,10 @@ class MeasurementStore:
         if only is not None:
             query += " AND frame IN (SELECT value FROM json_each(?))"
         chosen = () if only is None else (json.dumps(list(only)),)
-        rows = self._db.execute(f"{query} ORDER BY frame", (recording, *chosen))
-        frames = [_measurement(row, names) for row in rows]
-        method = self._db.execute("SELECT method FROM recordings WHERE id = ?", (recording,)).fetchone()[0]
+        with self._reading():
+            rows = self._db.execute(f"{query} ORDER BY frame", (recording, *chosen))
+            frames = [_measurement(row, names) for row in rows]
+            method = self._db.execute("SELECT method FROM recordings WHERE id = ?", (recording,)).fetchone()[0]
 
         def stacked(rows: list[Floats], like: Floats) -> Floats:
             return np.array(rows).reshape(len(frames), *like.shape)
@@ -286,3 +331,14 @@ def _unpacked(blob: bytes) -> list[Floats]:
     values = np.where(ticks == np.iinfo(np.int32).min, np.nan, ticks / 8192.0)
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
     return [part.reshape(shape) for part, shape in zip(np.split(values, ends[:-1]), shapes, strict=True)]
+
+
+def discard_unreadable(file: Path) -> None:
+    """Delete a file of measurements that can no longer be read, so that it can be made anew."""
+    if not file.is_file():
+        return
+    try:
+        with MeasurementStore(file) as store:
+            store.require_readable()
+    except InputError:
+        file.unlink()

@@ -19,6 +19,16 @@ def silent(stage: str, done: int, total: int) -> None:
     """Ignore progress: the default where nobody watches."""
 
 
+def heeding(cancel: CancelToken, progress: Progress) -> Progress:
+    """Return a progress that stops the work it is told of, by `Cancelled`, once somebody asked to."""
+
+    def told(stage: str, done: int, total: int) -> None:
+        progress(stage, done, total)
+        cancel.raise_if_cancelled()
+
+    return told
+
+
 class CancelToken:
     """A flag one thread raises and the working thread reads between two units of work."""
 

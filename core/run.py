@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -26,10 +26,10 @@ from core.ground_poses import fit_with_relief
 from core.lens import Lens, read_lens, require_image_size
 from core.locks import take_lock
 from core.measure import measure
-from core.measurements import MeasurementStore, Recording
+from core.measurements import MeasurementStore, Recording, discard_unreadable
 from core.orthoimage import ORTHOIMAGE_FILE, make_orthoimage, origin_of, read_origin, write_geotiff, write_origin
 from core.prediction import MeasureSetup
-from core.progress import CancelToken, Progress, silent
+from core.progress import CancelToken, Progress, heeding, silent
 from core.project import PROJECT_FILE, RESULTS_FOLDER, Project, naming_file, read_project
 from core.relief import Relief, rasterise
 from core.solve import solve
@@ -110,9 +110,13 @@ def run_project(
         InputError: with the first thing that keeps the project from being measured; earlier results stay as they were.
         Cancelled: on request; what was measured stays and the next run goes on from there.
     """
-    with naming_file(folder):
+    cancel = cancel or CancelToken()
+    progress = heeding(cancel, progress)
+    with ExitStack() as stack:
+        stack.enter_context(naming_file(folder))
         inputs = load_inputs(folder, progress)
         _require_runnable(inputs)
+        stack.enter_context(_only_writer(folder / RESULTS_FOLDER))
         started = time.perf_counter()
         recording, known = _recorded(
             inputs, fresh, workers=workers, scheduler=scheduler, progress=progress, cancel=cancel
@@ -147,8 +151,10 @@ def run_project(
 def _recorded(inputs: LoadedInputs, fresh: bool, **how: Any) -> tuple[Recording, int]:
     """Return the finished recording of a project, and how many of its frames an earlier run had measured."""
     setup = inputs.setup()
-    folder = inputs.folder / RESULTS_FOLDER
-    with _only_writer(folder), MeasurementStore(folder / FRAMES_FILE) as store:
+    file = inputs.folder / RESULTS_FOLDER / FRAMES_FILE
+    if fresh:
+        discard_unreadable(file)
+    with MeasurementStore(file) as store:
         found = None if fresh else store.find(setup.method, setup.fingerprint)
         known = 0 if found is None else len(store.measured_frames(found))
         return store.load(measure(setup, store, fresh=fresh, **how)), known
@@ -156,7 +162,7 @@ def _recorded(inputs: LoadedInputs, fresh: bool, **how: Any) -> tuple[Recording,
 
 @contextmanager
 def _only_writer(results: Path) -> Iterator[None]:
-    """Keep other processes from measuring the same project.
+    """Keep other processes from measuring the same project and writing its results.
 
     Raises:
         InputError: one of them does so already.
@@ -221,9 +227,10 @@ class ReliefPlan:
     def make(self, cloud: Cloud, plane: GroundPlane) -> Relief:
         """Make the relief from the cloud and keep it in place of earlier ones."""
         relief = rasterise(cloud, plane, self.extent_m, self.at_m)
-        for old in self.file.parent.glob(f"*-{RELIEF_FILE}"):
-            old.unlink()
         relief.save(self.file)
+        for old in set(self.file.parent.glob(f"*-{RELIEF_FILE}")) - {self.file}:
+            # The server and a run beside it may both be at this.
+            old.unlink(missing_ok=True)
         return relief
 
 

@@ -36,7 +36,7 @@ CACHE = Path("workspace/accuracy")
 Size = tuple[int, int]
 SIZE, SECONDS = re.compile(r"\d+x\d+"), re.compile(r"[\d.]+s")
 TRUTH_FILE = "truth.npz"
-# The paper's corner frequencies, and RMS it reports after filtering.
+# The paper's corner frequencies.
 PAPER_CORNER_HZ = {"eq5": 0.3, "eq5_slow_drift": 0.3}
 PAPER_USUAL_CORNER_HZ = 0.25
 
@@ -172,7 +172,8 @@ class PaperScore:
     Attributes:
         raw_mm: unfiltered, against the exact apparent motion: truth plus parallax.
         filtered_mm: filtered, against the truth.
-        geometric_mm: the geometric method's raw columns against the same apparent motion.
+        geometric_raw_mm: the geometric method's raw columns against the same apparent motion.
+        corner_hz: of the filter.
     """
 
     name: str

@@ -522,12 +522,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(table(results[-1:], chosen.frames, chosen.long_factor), flush=True)
     text = table(results, chosen.frames, chosen.long_factor)
     text += f"\n\nMedians of {chosen.runs}, {os.cpu_count()} cores; rewritten by `make bench BENCH_OPTIONS=--write`."
-    if processes_for(chosen.frames, 2, available_cores(), pixels=0) == 1:
-        text += f" With two workers, {chosen.frames} frames are measured by one process here: a second would not repay."
+    text += f" Of two workers, those that repay measure {chosen.frames} frames here: {_processes(chosen)}."
     print(text)
     if chosen.write:
         write_between_markers(README, "bench", f"\n{text}\n")
     return 0
+
+
+def _processes(chosen: argparse.Namespace) -> str:
+    """Say how many processes measure a clip of each size where there may be two."""
+    counts = {}
+    for size in chosen.sizes.split(","):
+        width, height = (int(part) for part in size.split("x"))
+        counts[size] = processes_for(chosen.frames, 2, available_cores(), pixels=width * height)
+    return ", ".join(f"{count} at {size.replace('x', '×')}" for size, count in counts.items())
 
 
 def _parser() -> argparse.ArgumentParser:

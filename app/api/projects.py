@@ -77,10 +77,9 @@ def _listed(here: Context, project_id: str) -> dict[str, Any]:
     try:
         folder = here.workspace.open(project_id)
         project = folder.load().project
+        steps, name = steps_of(here, folder, project, look=False).steps, project.name
     except (InputError, ApiError) as error:
         steps, name = steps_of_broken(problem_of(error)), project_id
-    else:
-        steps, name = steps_of(here, folder, project, look=False).steps, project.name
     return {"id": project_id, "name": name, "updated_s": here.workspace.updated_s(project_id), "steps": steps}
 
 

@@ -104,19 +104,35 @@ def test_run_queues_folders_and_the_projects_of_a_workspace(tmp_path: Path, engi
     assert [order["folder"].name for order in asked] == ["single", "a", "b"]
 
 
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (InputError("a: has no video;\nadd one."), "a: has no video; add one."),
+        (OSError(errno.ENOSPC, "No space left on device", "a"), "a: No space left on device; make room on the disk"),
+        (ZeroDivisionError("a mistake of ours"), "a mistake of ours"),
+    ],
+)
 def test_run_goes_on_after_a_project_that_cannot_be_measured(
-    tmp_path: Path, engine: Any, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, engine: Any, capsys: pytest.CaptureFixture[str], error: Exception, told: str
 ) -> None:
     def run(folder: Path, **rest: Any) -> None:
         if folder.name == "a":
-            raise InputError(f"{folder}: has no video;\nadd one.")
+            raise error
 
     asked = engine(run)
     for name in ("a", "b"):
         project_at(tmp_path / name)
     assert main(["run", str(tmp_path)]) == 1
     assert [order["folder"].name for order in asked] == ["a", "b"]
-    assert one_sentence(capsys.readouterr().err).endswith("a: has no video; add one.\n")
+    assert told in one_sentence(capsys.readouterr().err)
+
+
+def test_a_word_the_terminal_cannot_show_ends_no_command(tmp_path: Path) -> None:
+    project = project_at(tmp_path / "東")
+    command = [sys.executable, "-m", "app.cli", "check", str(project)]
+    done = subprocess.run(command, env={**os.environ, "PYTHONIOENCODING": "ascii"}, capture_output=True, check=False)
+    assert b"?: inputs.video" in done.stdout or b"?" in done.stdout
+    assert b"Unicode" not in done.stderr
 
 
 def test_ctrl_c_keeps_what_is_measured(tmp_path: Path, engine: Any, capsys: pytest.CaptureFixture[str]) -> None:
@@ -133,6 +149,14 @@ def test_ctrl_c_keeps_what_is_measured(tmp_path: Path, engine: Any, capsys: pyte
     assert len(asked) == 1
     assert "partial results kept" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_no_other_project_begins_after_ctrl_c(tmp_path: Path, engine: Any) -> None:
+    asked = engine(lambda folder, **rest: signal.raise_signal(signal.SIGINT))
+    for name in ("a", "b"):
+        project_at(tmp_path / name)
+    assert main(["run", str(tmp_path)]) == 130
+    assert [order["folder"].name for order in asked] == ["a"]
 
 
 def test_a_second_ctrl_c_stops_at_once(tmp_path: Path, engine: Any) -> None:

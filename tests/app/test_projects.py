@@ -13,11 +13,14 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
 from app.context import Context
 from app.server import create_app
+from core.coordinates import OrthoGrid
+from core.orthoimage import ORTHOIMAGE_FILE, Orthoimage, write_geotiff
 from tests.app.conftest import ADDRESS, WRITE
 
 SMALL = "/api/projects/small"
@@ -325,6 +328,21 @@ def test_a_broken_project_file_is_listed_with_its_problem(client: TestClient, wo
     assert "line 1" in project["steps"]["inputs"]["message"]
     answer = client.get(SMALL)
     assert (answer.status_code, answer.json()["error"]["kind"]) == (422, "input")
+
+
+def test_an_orthoimage_of_a_cloud_out_of_reach_hides_no_project(client: TestClient, workspace: Path) -> None:
+    document = json.loads((workspace / "small" / "project.json").read_text())
+    document["inputs"]["cloud"] = "/var/site.laz"
+    (workspace / "small" / "project.json").write_text(json.dumps(document))
+    # A run from the terminal may read any file.
+    rgb, empty = np.zeros((30, 40, 3), np.uint8), np.zeros((30, 40), dtype=np.bool_)
+    grid = OrthoGrid(west_m=0.0, north_m=0.3, pixel_size_m=0.01, width=40, height=30)
+    image = Orthoimage(grid, rgb, empty, measured_share=1.0, filled_share=0.0, spacing_m=0.01, fill_limit_m=0.1)
+    (workspace / "small" / "results").mkdir(exist_ok=True)
+    write_geotiff(workspace / "small" / "results" / ORTHOIMAGE_FILE, image)
+    (project,) = client.get("/api/projects").json()
+    assert project["steps"]["orthoimage"]["status"] == "stale"
+    assert client.get(SMALL).status_code == 200
 
 
 def test_a_project_that_leads_elsewhere_is_listed_with_its_problem_and_keeps_no_server_from_starting(

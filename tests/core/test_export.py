@@ -351,3 +351,35 @@ def test_results_that_find_no_room_leave_the_earlier_ones(
         write_results(tmp_path, replace(made, version="0.2.0"))
     assert refused.value.filename == str(tmp_path)
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_results_that_find_their_place_taken_leave_the_earlier_ones(video: Path, tmp_path: Path) -> None:
+    made = results(video, scene.project_document(), solved())
+    write_results(tmp_path, made)
+    (tmp_path / "report.html").unlink()
+    (tmp_path / "report.html").mkdir()
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    with pytest.raises(IsADirectoryError) as refused:
+        write_results(tmp_path, replace(made, version="0.2.0"))
+    assert refused.value.filename == str(tmp_path / "report.html")
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_what_a_killed_run_was_writing_is_cleared_away(video: Path, tmp_path: Path) -> None:
+    left_over = tmp_path / f"{export.BEING_WRITTEN}abc" / "figures"
+    left_over.mkdir(parents=True)
+    write_results(tmp_path, results(video, scene.project_document(), solved()))
+    assert [file.name for file in tmp_path.iterdir() if file.name.startswith(".")] == []
+
+
+def test_the_summary_comes_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    moved: list[str] = []
+    replace_file = Path.replace
+    monkeypatch.setattr(Path, "replace", lambda file, place: (moved.append(place.name), replace_file(file, place))[1])
+    with export._all_or_none(tmp_path) as made:
+        for name in ("summary.json", "a.csv", "z.csv"):
+            (made / name).touch()
+    assert sorted(moved[:2]) == ["a.csv", "z.csv"]
+    assert moved[2] == "summary.json"

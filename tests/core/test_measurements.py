@@ -3,6 +3,8 @@ from __future__ import annotations
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import pytest
 
 from core.apparent import Apparent
 from core.errors import InputError
-from core.measurements import FrameMeasurement, MeasurementStore, Reference
+from core.measurements import FrameMeasurement, MeasurementStore, Reference, discard_unreadable
 
 # Raw pixels are kept to this part of a pixel.
 TICK_PX = 1 / 8192
@@ -193,6 +195,60 @@ def test_a_file_that_is_something_else_is_refused_and_kept(tmp_path: Path) -> No
     with pytest.raises(InputError, match=r"frames\.sqlite: is not readable .* delete it, it can be measured again"):
         MeasurementStore(file)
     assert file.read_bytes().startswith(b"this is no database")
+
+
+def spoil_pages(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[8192:-4096] = bytes(len(content) - 12288)
+    file.write_bytes(content)
+
+
+def other_tables(file: Path) -> None:
+    file.unlink()
+    with closing(sqlite3.connect(file)) as made:
+        made.execute("CREATE TABLE recordings (id INTEGER PRIMARY KEY, name TEXT)")
+
+
+def spoil_a_frame(file: Path) -> None:
+    with closing(sqlite3.connect(file)) as made, made:
+        made.execute("UPDATE frames SET measured = substr(measured, 1, 300) WHERE frame = 7")
+
+
+@pytest.mark.parametrize("damage", [spoil_pages, other_tables, spoil_a_frame])
+def test_damage_is_told_with_its_remedy(tmp_path: Path, damage: Callable[[Path], None]) -> None:
+    file = tmp_path / "frames.sqlite"
+    fill(file, range(60))
+    damage(file)
+
+    def read_all() -> None:
+        with MeasurementStore(file) as store:
+            found = store.find("geometric", "a")
+            assert found is not None
+            store.load(found)
+
+    with pytest.raises(InputError, match=r"frames\.sqlite: is not readable .* delete it, it can be measured again"):
+        read_all()
+
+
+def test_what_cannot_be_read_makes_room_for_a_fresh_start(tmp_path: Path) -> None:
+    file = tmp_path / "frames.sqlite"
+    discard_unreadable(file)
+    recording = fill(file, range(60))
+    discard_unreadable(file)
+    with MeasurementStore(file) as store:
+        assert len(store.measured_frames(recording)) == 60
+    spoil_pages(file)
+    discard_unreadable(file)
+    assert not file.exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="open files are listed by Linux only")
+def test_a_file_that_is_refused_is_let_go_of(tmp_path: Path) -> None:
+    file = tmp_path / "frames.sqlite"
+    file.write_bytes(b"this is no database, but long enough to be looked at" * 40)
+    with pytest.raises(InputError):
+        MeasurementStore(file)
+    assert file.resolve() not in {link.resolve() for link in Path("/proc/self/fd").iterdir()}
 
 
 def test_a_file_that_cannot_be_opened_is_not_to_be_deleted(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from core.lens import read_lens, write_lens
 from core.locks import take_lock
 from core.measure import make_measurer, measure_chunk
 from core.measurements import MeasurementStore
+from core.progress import CancelToken
 from core.project import read_project
 from core.results import Status, read_history_csv
 from core.run import FRAMES_FILE, RELIEF_FILE, load_inputs, run_project
@@ -431,6 +432,21 @@ def test_one_process_at_a_time_measures_a_project(run, tmp_path):
     with lock, pytest.raises(InputError, match="busy: is being measured by another process; wait for its end"):
         run_project(folder)
     assert run_project(folder).frames_measured == 0
+
+
+@pytest.mark.parametrize("stage", ["solving", "drawing figures"])
+def test_a_run_that_is_stopped_behind_the_measuring_writes_nothing(run, tmp_path, stage):
+    folder = with_measurements(run, tmp_path / "stopped")
+    cancel = CancelToken()
+
+    def stop(told, done, total):
+        if told == stage:
+            cancel.cancel()
+
+    with pytest.raises(Cancelled):
+        run_project(folder, progress=stop, cancel=cancel)
+    assert not (folder / "results" / "summary.json").exists()
+    assert frames_kept(folder) == ALL_FRAMES
 
 
 def test_what_only_geometry_needs_never_reads_the_video_again(run, history, tmp_path):
