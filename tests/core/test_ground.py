@@ -109,6 +109,17 @@ def test_regions_over_everything_are_refused() -> None:
         choose_features(reference(), everything, 80, LENS)
 
 
+def test_no_feature_lies_beyond_the_end_of_the_lens_model() -> None:
+    lens = Lens(SIZE, LENS.camera_matrix, np.array([-0.9, 0, 0, 0, 0]))
+    still = reference()
+    assert np.isnan(lens.rays_from_raw(features())).any()
+    points = choose_features(still, REGIONS, 80, lens)
+    assert len(points) > 20
+    found = GroundTracker(still, points, lens, ground_mask(still.shape, REGIONS)).find(still, None)
+    assert found is not None
+    assert found.inliers == len(points)
+
+
 def test_a_blank_reference_frame_is_refused() -> None:
     with pytest.raises(InputError, match="ground features in the reference frame"):
         choose_features(frame(np.full(SIZE[::-1], 128.0)), REGIONS, 80, LENS)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from core.coordinates import Floats, rotation_2d
-from core.patches import HALF_PX, MARGIN_PX, MAX_WANDER_PX, Matches, PatchTracker
+from core.patches import HALF_PX, LEAST_SCORE, MARGIN_PX, MAX_WANDER_PX, Matches, PatchTracker
 from tests.waves import frame, pixels, waves
 
 SIZE = (260, 200)
@@ -169,6 +169,14 @@ def test_what_views_do_not_show_stays_as_the_reference_frame_shows_it() -> None:
     patches.denoise([views] * 8)
     found = patches.track(frame(TEXTURE(pixels(SIZE))), points(), still)
     assert np.abs(found.raw - points())[20:].max() < 0.02
+
+
+def test_without_views_patches_stay_as_they_are() -> None:
+    patches, still = tracker(), np.broadcast_to(STILL, (40, 2, 2))
+    nothing = patches.views(frame(TEXTURE(pixels(SIZE))), np.full((40, 2), np.nan), still)
+    patches.denoise([nothing] * 16)
+    assert patches.least_score == LEAST_SCORE
+    assert not patches.is_averaged
 
 
 def test_more_patches_than_fit_below_one_another_are_found_too() -> None:

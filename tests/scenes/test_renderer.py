@@ -143,7 +143,7 @@ def test_scenes_keep_their_promises(name):
     still = scene.measured[0].plate.motion(np.linspace(start, end, 50))
     assert np.abs(still).max() < 1e-9 or brief.starts_s > 0
     R, C = scene.flight.pose(np.linspace(0, scene.duration_s, 300))
-    assert np.abs(C - C[0]).max() == pytest.approx(brief.drift_m, rel=1.0)
+    assert np.abs(C - C[0]).max() == pytest.approx(brief.drift_m, rel=0.02)
     assert np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1.0)
 
