@@ -17,11 +17,15 @@ import numpy as np
 import pytest
 import uvicorn
 
+from app import sites
 from app.context import Context
+from app.errors import NotYet
 from app.server import create_app
 from core.cloud import CLOUD_SUFFIXES
 from core.lens import Lens, write_lens
 from core.lens_calibration import IMAGE_SUFFIXES
+from core.locks import take_lock
+from core.progress import CancelToken, silent
 from core.video import frame_index
 from tests.app.conftest import ADDRESS, WRITE, TestClient
 from tests.small_project import SIZE, write_interlaced_video
@@ -239,6 +243,35 @@ def test_a_cloud_is_read_beside_the_server_and_known_from_then_on(
     project["project"]["orthoimage"]["pixel_size_m"] = 0.02
     client.put(SMALL, json={"project": project["project"], "revision": project["revision"]})
     assert client.get(f"{SMALL}/orthoimage").json()["stale"]
+
+
+def test_a_job_waits_for_another_that_reads_the_cloud_and_nobody_opens_what_is_being_replaced(
+    client: TestClient, context: Context, workspace: Path, finished: Callable[[dict[str, Any]], dict[str, Any]]
+) -> None:
+    client.get(f"{SMALL}/inputs")
+    job = context.jobs.latest("small", "cloud")
+    assert job is not None
+    assert finished(job.as_json())["state"] == "done"
+    folder = workspace / "small"
+    cache = folder / "results" / "cache"
+    facts = json.loads((cache / "cloud.json").read_text())
+    with pytest.raises(NotYet):  # another key: that other job has just kept another cloud
+        sites._load(cache, "another key")
+    for array in cache.glob("cloud_*.npy"):
+        array.unlink()
+    with pytest.raises(NotYet):
+        sites._load(cache, facts["key"])
+    other_job = take_lock(cache)
+    assert other_job is not None
+    order = {"cloud": str(folder / "site.csv"), "key": facts["key"], "ground_z_m": None}
+    reading = threading.Thread(target=sites.read_site, args=(folder, order, silent, CancelToken()))
+    reading.start()
+    reading.join(1.0)
+    assert reading.is_alive()
+    assert not list(cache.glob("cloud_*.npy"))
+    other_job.close()
+    reading.join()
+    assert len(sites._load(cache, facts["key"]).cloud) == 80 * 80
 
 
 def test_a_cloud_asked_for_twice_at_once_is_read_once_and_no_error(
