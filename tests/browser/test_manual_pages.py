@@ -17,7 +17,7 @@ from playwright.sync_api import APIResponse, Page, Route, expect
 from core.lens import read_lens
 from core.project import read_project
 from tests.browser.hands import centre_of, fitted, zoomed
-from tests.browser.live import SAMPLE, arrived, ask, ask_bytes, eventually, watched
+from tests.browser.live import SAMPLE, arrived, ask, ask_bytes, edit_elsewhere, eventually, watched
 from tests.browser.steps import (
     FRAME_SIZE,
     draw_bands,
@@ -327,6 +327,39 @@ def test_clicks_on_the_undistorted_frame_are_stored_raw(browser, project):
         expect(page.get_by_label("u", exact=True)).not_to_have_value("")
         stored = [float(page.get_by_label(name, exact=True).input_value()) for name in ("u", "v")]
     assert np.array(stored) == pytest.approx(lens.distort(wanted), abs=CLICK_PX)
+
+
+def test_a_picture_that_comes_late_takes_no_newer_ones_place(browser, project):
+    _, pages = project
+    whole = "x".join(str(size) for size in FRAME_SIZE)
+    late: list[Route] = []
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions")
+        ready(page, "Reference frame"), ready(page, "Orthorectified")
+        page.route("**/frames/1.jpg", lambda route: late.append(route), times=1)
+        edit_elsewhere(page, pages, reference_frame=1)
+        answer = arrived(page, late)
+        edit_elsewhere(page, pages, reference_frame=3)
+        page.wait_for_timeout(1500)
+        answer.fulfill(body=ask_bytes(pages, "frames/1.jpg?w=160"), content_type="image/jpeg")
+        expect(page.locator(".pane-chip", has_text="Frame 3 · raw")).to_be_visible()
+        page.wait_for_timeout(500)
+        expect(pane(page, "Reference frame")).to_have_attribute("data-picture", whole)
+
+        plan = pane(page, "Orthorectified")
+        box = plan.bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        place = plan.locator(".pane-readout").inner_text()
+        late.clear()
+        page.route("**/rectified.jpg*", lambda route: late.append(route), times=1)
+        edit_elsewhere(page, pages, orthoimage=ask(pages, "")["project"]["orthoimage"] | {"pixel_size_m": 0.07})
+        answer = arrived(page, late)
+        page.mouse.move(box["x"] + box["width"] / 2 + 1, box["y"] + box["height"] / 2)
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        page.wait_for_timeout(200)
+        assert plan.locator(".pane-readout").inner_text() == place  # the raster belongs to the picture
+        answer.continue_()
+        ready(page, "Orthorectified")
 
 
 def test_points_go_to_qgis_and_come_back(browser, project, tmp_path):

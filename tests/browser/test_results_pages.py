@@ -459,6 +459,26 @@ def test_table_2_says_what_the_summary_says(browser, headless, finished):
         expect(page.get_by_label("GPS", exact=True)).to_contain_text(f"{1000 * gps['rms_m']['x']:.1f}")
 
 
+def test_what_was_asked_of_one_target_is_not_shown_as_anothers(browser, finished):
+    validation = ask(finished, "validation?target=roof")
+    other = validation | {"table": [row | {"video_m": 0.1234} for row in validation["table"]]}
+    late: list[Route] = []
+    with watched(browser, finished) as page:
+        results = ask(finished, "results")
+        page.route("**/results", lambda route: route.fulfill(json=results | {"targets": ["roof", "annex"]}))
+        page.route("**/validation?target=roof*", lambda route: late.append(route))
+        page.route("**/validation?target=annex*", lambda route: route.fulfill(json=other))
+        page.goto(f"{finished}/export")
+        arrived(page, late)
+        page.get_by_role("radio", name="annex").click()
+        page.wait_for_timeout(500)
+        for route in late:
+            route.fulfill(json=validation)
+        expect(page.locator(".comparison tbody tr").first).to_contain_text("12.34")
+        page.wait_for_timeout(500)
+        expect(page.locator(".comparison tbody tr").first).to_contain_text("12.34")
+
+
 def test_a_result_from_before_a_change_says_so(browser, project):
     folder, pages = project
     document = json.loads((folder / "project.json").read_text())
