@@ -326,6 +326,19 @@ def test_clicks_on_the_undistorted_frame_are_stored_raw(browser, project):
         page.mouse.click(*np.round(lies.window(wanted)))
         expect(page.get_by_label("u", exact=True)).not_to_have_value("")
         stored = [float(page.get_by_label(name, exact=True).input_value()) for name in ("u", "v")]
+
+        def no_image(route: Route) -> None:
+            if route.request.post_data_json["from"] == "und":
+                route.fulfill(json={"points": [None]})
+            else:
+                route.continue_()
+
+        page.route("**/transform", no_image)
+        marks = page.locator("[data-id^='pair-']")
+        expect(marks).to_have_count(21)
+        page.mouse.click(*np.round(lies.window(wanted) + [60.0, 0.0]))
+        expect(page.get_by_role("status").filter(has_text="the lens has no image of this place")).to_be_visible()
+        expect(marks).to_have_count(21)
     assert np.array(stored) == pytest.approx(lens.distort(wanted), abs=CLICK_PX)
 
 
@@ -822,6 +835,12 @@ def test_a_clicked_height_and_a_region_make_a_target_of_points(browser, project,
         page.mouse.click(*fitted(page, pane_of_ground, (grid["width"], grid["height"])).window(ortho_px(grid, place)))
         expect(page.locator("#height .value").first).to_contain_text("18.")
         page.get_by_role("button", name="Take this height").click()
+        saved(page)
+        wall = {"xyz_m": [*place, 9.0], "height_m": 9.0, "spread_m": None, "points": 1}
+        events = f"event: pick\ndata: {json.dumps(wall)}\n\n"  # a click into the 3D scene
+        page.route("**/events", lambda route: route.fulfill(body=events, content_type="text/event-stream"), times=1)
+        page.reload()
+        expect(page.locator("#height .value")).to_have_text(["9.00 m", "–"])
 
         page.goto(f"{pages}/regions?layout=plan")
         ready(page, "Orthorectified")

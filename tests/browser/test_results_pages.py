@@ -436,6 +436,16 @@ def test_the_interval_of_rest_is_dragged_on_the_plot(browser, project):
         handle.press("Shift+ArrowLeft")
         expect(handle).to_have_attribute("aria-valuenow", f"{end - 1:.2f}")
         eventually(lambda: read_project(folder).intervals_s.pre_event[1] == pytest.approx(end - 1, abs=0.002))
+        before = read_project(folder).intervals_s
+        box = handle.bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 60)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 100, box["y"] + 60, steps=4)
+        expect(handle).not_to_have_attribute("aria-valuenow", f"{before.pre_event[1]:.2f}")
+        handle.dispatch_event("pointercancel", {"pointerId": 1})  # the system takes the drag over
+        page.mouse.up()
+        expect(handle).to_have_attribute("aria-valuenow", f"{before.pre_event[1]:.2f}")
+        assert read_project(folder).intervals_s == before
         field = page.get_by_role("textbox", name="Residual to")
         field.fill("500")
         field.press("Enter")

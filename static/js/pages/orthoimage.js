@@ -103,7 +103,7 @@ pane.on("click", async ({ point }) => {
 });
 page.events.on("pick", ({ xyz_m, height_m, spread_m, points, message }) => {
   if (xyz_m && height_m !== undefined)
-    heights.show({ place_m: xyz_m, height_m, spread_m: spread_m ?? 0, points: points ?? 0 });
+    heights.show({ place_m: xyz_m, height_m, spread_m: spread_m ?? null, points: points ?? 0 });
   else heights.refuse(message ?? "The click met nothing of the cloud.");
 });
 
