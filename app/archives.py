@@ -14,12 +14,12 @@ import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
-from app.errors import Invalid
+from app.errors import FORBIDDEN, Invalid
 from app.history import DAMAGED_FILE, HISTORY_FILE
 from app.jobs import JOB_FILE
 from app.store import CACHE_FOLDER, ProjectFolder, Workspace, stored_inputs, with_inputs
 from app.uploads import SPARE_BYTES
-from core.errors import InputError
+from core.errors import DISK_FULL, InputError
 from core.project import PROJECT_FILE, RESULTS_FOLDER, Project, parse_project, project_json, write_project
 
 INPUTS_FOLDER = "inputs"
@@ -136,6 +136,7 @@ def restore(workspace: Workspace, archive_file: Path, name: str | None) -> Proje
     Raises:
         Invalid: no zip, no project in it or one that cannot be used, a name that leads outside, a link, or far more
             content than its size.
+        OSError: the disk is full, or does not allow writing.
     """
     folder = archive_file.with_name(f"{archive_file.name}.folder")
     try:
@@ -150,6 +151,8 @@ def restore(workspace: Workspace, archive_file: Path, name: str | None) -> Proje
         write_project(folder, project)
         return workspace.adopt(folder, project.name)
     except _DAMAGE as error:
+        if isinstance(error, OSError) and error.errno in (*DISK_FULL, *FORBIDDEN):
+            raise  # it is the disk's doing, and another archive would fare no better
         raise Invalid(f"The archive is damaged or no zip file ({error}); choose one made by Rooftrack.") from None
     except RuntimeError:
         raise Invalid("The archive is encrypted; unpack it and pack it again without a password.") from None

@@ -14,7 +14,7 @@ from starlette.exceptions import HTTPException
 
 from core.errors import DISK_FULL, OBSTRUCTED, Cancelled, InputError, disk_problem
 
-_FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
+FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
 
 
 class ApiError(Exception):
@@ -109,7 +109,7 @@ def install_error_handlers(app: FastAPI) -> None:
     def _disk(request: Request, error: OSError) -> JSONResponse:
         if error.errno in DISK_FULL:
             words = "The disk is full, so nothing was written; make room, then do it again."
-        elif error.errno in _FORBIDDEN:
+        elif error.errno in FORBIDDEN:
             name = Path(str(error.filename or "the project's folder")).name
             words = f"The computer does not allow writing to {name}, or reading it; allow it, then do it again."
         elif error.errno in OBSTRUCTED:

@@ -5,6 +5,7 @@ Whoever looks at a frame looks next at the one after it, or before it: both are 
 
 from __future__ import annotations
 
+import hashlib
 import threading
 import time
 from collections import OrderedDict
@@ -99,7 +100,7 @@ class FrameStore:
         Raises:
             InputError: there is no such video or no such frame.
         """
-        key = (fingerprint(video), number, width, _lens_key(lens))
+        key = _jpeg_key(video, number, width, lens)
         found = self._jpegs.get(key)
         if found is None:
             frame = self.frame(video, number)
@@ -250,6 +251,19 @@ def png_of(rgb: Picture, opacity: Picture) -> bytes:
     """Return a picture with transparent places as PNG."""
     bgra = np.dstack([rgb[..., ::-1], opacity])
     return cv2.imencode(".png", bgra, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
+
+
+def jpeg_tag(video: File, number: int, *, width: int | None = None, lens: Lens | None = None) -> str:
+    """Return what changes with the JPEG of a frame, without decoding it.
+
+    Raises:
+        InputError: there is no such video.
+    """
+    return hashlib.sha256(repr((JPEG_QUALITY, *_jpeg_key(video, number, width, lens))).encode()).hexdigest()[:32]
+
+
+def _jpeg_key(video: File, number: int, width: int | None, lens: Lens | None) -> Any:
+    return fingerprint(video), number, width, _lens_key(lens)
 
 
 def _lens_key(lens: Lens | None) -> Any:

@@ -39,11 +39,14 @@ class Places:
         """Return the real place of an absolute path.
 
         Raises:
-            Refused: the place, or what a link at it leads to, lies outside the roots.
+            Refused: the place, or what a link at it leads to, lies outside the roots, or in nobody's home.
         """
         if "\0" in str(path):
             raise Refused("A path cannot hold a null character; correct it.", path=None)
-        place = Path(path).expanduser()
+        try:
+            place = Path(path).expanduser()
+        except RuntimeError:
+            raise Refused(f"{path}: there is no such home folder; give the whole path.", path=str(path)) from None
         if not place.is_absolute():
             raise Refused(f"{path}: is not an absolute path; give the whole path.", path=str(path))
         real = Path(os.path.realpath(place))

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import threading
+import time
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +23,7 @@ from app.store import CACHE_FOLDER, ProjectFolder, read_json
 from core.cloud import Cloud, read_cloud
 from core.errors import InputError
 from core.ground_plane import GroundPlane, fit_ground_plane
+from core.locks import take_lock
 from core.progress import CancelToken, Progress
 from core.project import RESULTS_FOLDER, Project, read_project
 from core.relief import Relief
@@ -29,6 +33,8 @@ from core.storage import write_atomically
 _FACTS = "cloud.json"
 _ARRAYS = ("points_m", "colour", "intensity")
 _KEPT = 2
+_LOOKS_AGAIN_S = 0.1
+_BEING_READ = "The cloud is being read; it takes a moment the first time."
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +77,7 @@ class Sites:
         """
         path = folder.require_input("cloud", project)
         if self.facts(folder, project, path) is None:
-            raise NotYet("The cloud is being read; it takes a moment the first time.", path="inputs.cloud")
+            raise NotYet(_BEING_READ, path="inputs.cloud")
         return self._site(folder, site_key(path, project))
 
     def _site(self, folder: ProjectFolder, key: str) -> Site:
@@ -155,12 +161,15 @@ def site_key(path: Path, project: Project) -> str:
 
 
 def _known(folder: ProjectFolder, key: str) -> dict[str, Any] | None:
-    facts = read_json(folder.results / CACHE_FOLDER / _FACTS)
+    cache = folder.results / CACHE_FOLDER
+    facts = read_json(cache / _FACTS)
     if not isinstance(facts, dict) or facts.get("key") != key:
         return None
     if "error" in facts:
         raise InputError(facts["error"])
-    return {name: value for name, value in facts.items() if name not in ("key", "source", "plane")}
+    if not _has_arrays(cache, facts):
+        return None
+    return {name: value for name, value in facts.items() if name not in ("key", "source", "arrays", "plane")}
 
 
 def read_site(folder: Path, order: dict[str, Any], progress: Progress, cancel: CancelToken) -> Site:
@@ -171,19 +180,30 @@ def read_site(folder: Path, order: dict[str, Any], progress: Progress, cancel: C
     """
     cache, path, key = folder / RESULTS_FOLDER / CACHE_FOLDER, Path(order["cloud"]), str(order["key"])
     cache.mkdir(parents=True, exist_ok=True)
-    try:
-        cloud = _cached_cloud(cache, path, progress)
+    with _alone(cache, cancel):
+        try:
+            cloud = _cached_cloud(cache, path, progress)
+            cancel.raise_if_cancelled()
+            plane = fit_ground_plane(cloud, order["ground_z_m"])
+        except InputError as error:
+            _write_facts(cache, {"key": key, "error": str(error)})
+            raise
+        _write_facts(cache, {"key": key, **_kept(cloud, path), **_described(cloud, plane)})
         cancel.raise_if_cancelled()
-        plane = fit_ground_plane(cloud, order["ground_z_m"])
-    except InputError as error:
-        _write_facts(cache, {"key": key, "error": str(error)})
-        raise
-    _write_facts(cache, {"key": key, "source": list(fingerprint(path)), **_described(cloud, plane)})
-    cancel.raise_if_cancelled()
-    wanted = relief_plan(folder, read_project(folder))
-    if wanted is not None and not wanted.file.is_file():
-        wanted.make(cloud, plane)
+        wanted = relief_plan(folder, read_project(folder))
+        if wanted is not None and not wanted.file.is_file():
+            wanted.make(cloud, plane)
     return Site(key, cloud, plane)
+
+
+@contextlib.contextmanager
+def _alone(cache: Path, cancel: CancelToken) -> Iterator[None]:
+    """Wait while another job reads the project's cloud: what it has read need not be read again."""
+    while (lock := take_lock(cache)) is None:
+        cancel.raise_if_cancelled()
+        time.sleep(_LOOKS_AGAIN_S)
+    with lock:
+        yield
 
 
 @lru_cache(maxsize=8)
@@ -193,32 +213,55 @@ def _relief(file: Fingerprint) -> Relief | None:
 
 def _cached_cloud(cache: Path, path: Path, progress: Progress) -> Cloud:
     facts = read_json(cache / _FACTS)
-    if isinstance(facts, dict) and facts.get("source") == list(fingerprint(path)):
+    if isinstance(facts, dict) and facts.get("source") == list(fingerprint(path)) and _has_arrays(cache, facts):
         return _arrays(cache, facts)
     cloud = read_cloud(path, progress)
     _write_facts(cache, {})
-    for name in _ARRAYS:
-        file = cache / f"cloud_{name}.npy"
-        file.unlink(missing_ok=True)
-        array = getattr(cloud, name)
-        if array is not None:
-            np.save(file, array)
+    for old in cache.glob("cloud_*.npy"):
+        old.unlink()
+    kept = _kept(cloud, path)
+    for name in kept["arrays"]:
+        np.save(_array_file(cache, kept, name), getattr(cloud, name))
     return cloud
 
 
+def _kept(cloud: Cloud, path: Path) -> dict[str, Any]:
+    """Return the facts by which a cloud's arrays are found again."""
+    arrays = [name for name in _ARRAYS if getattr(cloud, name) is not None]
+    return {"source": list(fingerprint(path)), "arrays": arrays}
+
+
+def _has_arrays(cache: Path, facts: dict[str, Any]) -> bool:
+    """Whether all arrays of a cloud are there; an earlier Rooftrack kept them under other names."""
+    return "arrays" in facts and all(_array_file(cache, facts, name).is_file() for name in facts["arrays"])
+
+
+def _array_file(cache: Path, facts: dict[str, Any], name: str) -> Path:
+    """Return where an array is kept: each file of a cloud has names of its own, so that no two are ever mixed."""
+    source = hashlib.sha256(json.dumps(facts["source"]).encode()).hexdigest()[:16]
+    return cache / f"cloud_{name}_{source}.npy"
+
+
 def _load(cache: Path, key: str) -> Site:
+    """Return what a job has kept.
+
+    Raises:
+        NotYet: another job has begun to replace it.
+    """
     facts = read_json(cache / _FACTS)
+    if not isinstance(facts, dict) or facts.get("key") != key:
+        raise NotYet(_BEING_READ, path="inputs.cloud")
     plane: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value for name, value in facts["plane"].items()
     }
-    return Site(key, _arrays(cache, facts), GroundPlane(**plane))
+    try:
+        return Site(key, _arrays(cache, facts), GroundPlane(**plane))
+    except FileNotFoundError:
+        raise NotYet(_BEING_READ, path="inputs.cloud") from None
 
 
 def _arrays(cache: Path, facts: dict[str, Any]) -> Cloud:
-    found: dict[str, Any] = {}
-    for name in _ARRAYS:
-        file = cache / f"cloud_{name}.npy"
-        found[name] = np.load(file, mmap_mode="r") if file.is_file() else None
+    found = {name: np.load(_array_file(cache, facts, name), mmap_mode="r") for name in facts["arrays"]}
     return Cloud(origin_m=np.array(facts["origin_m"]), notes=tuple(facts["notes"]), **found)
 
 

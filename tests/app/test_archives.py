@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -14,6 +15,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from app import archives
 from app.archives import archive_stream
 from app.context import Context
 from core.locks import LOCK_FILE
@@ -135,6 +137,19 @@ def test_an_archive_damaged_in_what_was_packed_is_refused(
     place = content.find(b"notes.txt") + 50
     answer = restore(client, content[:place] + b"\xff" * 20 + content[place + 20 :])
     assert (answer.status_code, "damaged" in answer.json()["error"]["message"]) == (422, True)
+    assert names(workspace) == ["small"]
+
+
+def test_a_disk_that_fills_up_is_not_the_archives_fault(
+    client: TestClient, workspace: Path, project: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(archives, "_unpack", full)
+    answer = restore(client, packed({}, project))
+    assert answer.status_code == 507
+    assert "The disk is full" in answer.json()["error"]["message"]
     assert names(workspace) == ["small"]
 
 

@@ -85,7 +85,14 @@ def test_the_walls_of_browsing(client: TestClient, workspace: Path, tmp_path: Pa
     inside = client.get("/api/browse", params={"dir": str(workspace / "small"), "kind": "video"}).json()
     assert [(entry["name"], entry["kind"]) for entry in inside["entries"]] == [("video.mp4", "video")]
     assert inside["parent"] == str(workspace)
-    for outside in (tmp_path, workspace / "..", workspace / "leads out", Path("/etc"), Path("relative")):
+    for outside in (
+        tmp_path,
+        workspace / "..",
+        workspace / "leads out",
+        Path("/etc"),
+        Path("relative"),
+        Path("~nobody-here/a"),
+    ):
         assert client.get("/api/browse", params={"dir": str(outside)}).status_code == 403, outside
         assert client.get("/api/browse/which", params={"path": str(outside)}).status_code == 403, outside
     assert client.get("/api/browse", params={"dir": str(workspace / "none")}).status_code == 404

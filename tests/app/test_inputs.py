@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,18 @@ import numpy as np
 import pytest
 import uvicorn
 
+from app import sites
 from app.context import Context
+from app.errors import NotYet
 from app.server import create_app
 from core.cloud import CLOUD_SUFFIXES
+from core.lens import Lens, write_lens
 from core.lens_calibration import IMAGE_SUFFIXES
+from core.locks import take_lock
+from core.progress import CancelToken, silent
 from core.video import frame_index
 from tests.app.conftest import ADDRESS, WRITE, TestClient
-from tests.small_project import write_interlaced_video
+from tests.small_project import SIZE, write_interlaced_video
 
 SMALL = "/api/projects/small"
 
@@ -239,6 +245,35 @@ def test_a_cloud_is_read_beside_the_server_and_known_from_then_on(
     assert client.get(f"{SMALL}/orthoimage").json()["stale"]
 
 
+def test_a_job_waits_for_another_that_reads_the_cloud_and_nobody_opens_what_is_being_replaced(
+    client: TestClient, context: Context, workspace: Path, finished: Callable[[dict[str, Any]], dict[str, Any]]
+) -> None:
+    client.get(f"{SMALL}/inputs")
+    job = context.jobs.latest("small", "cloud")
+    assert job is not None
+    assert finished(job.as_json())["state"] == "done"
+    folder = workspace / "small"
+    cache = folder / "results" / "cache"
+    facts = json.loads((cache / "cloud.json").read_text())
+    with pytest.raises(NotYet):  # another key: that other job has just kept another cloud
+        sites._load(cache, "another key")
+    for array in cache.glob("cloud_*.npy"):
+        array.unlink()
+    with pytest.raises(NotYet):
+        sites._load(cache, facts["key"])
+    other_job = take_lock(cache)
+    assert other_job is not None
+    order = {"cloud": str(folder / "site.csv"), "key": facts["key"], "ground_z_m": None}
+    reading = threading.Thread(target=sites.read_site, args=(folder, order, silent, CancelToken()))
+    reading.start()
+    reading.join(1.0)
+    assert reading.is_alive()
+    assert not list(cache.glob("cloud_*.npy"))
+    other_job.close()
+    reading.join()
+    assert len(sites._load(cache, facts["key"]).cloud) == 80 * 80
+
+
 def test_a_cloud_asked_for_twice_at_once_is_read_once_and_no_error(
     client: TestClient, context: Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -330,6 +365,29 @@ def test_frames_are_shown_raw_undistorted_and_smaller(client: TestClient) -> Non
     assert cv2.imdecode(np.frombuffer(small, np.uint8), cv2.IMREAD_COLOR).shape == (60, 80, 3)
     answer = client.get(f"{SMALL}/frames/40.jpg")
     assert (answer.status_code, answer.json()["error"]["kind"]) == (422, "input")
+
+
+def test_a_frame_is_sent_again_only_where_the_picture_is_another(
+    client: TestClient, workspace: Path, context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ask(tag: str = "", **options: int) -> Any:
+        return client.get(f"{SMALL}/frames/3.jpg", params=options, headers={"If-None-Match": tag})
+
+    answers = {und: ask(und=und) for und in (0, 1)}
+    tags = {und: answer.headers["ETag"] for und, answer in answers.items()}
+    assert {answer.headers["Cache-Control"] for answer in answers.values()} == {"private, no-cache"}
+    with monkeypatch.context() as patched:
+        patched.setattr(context.frames, "jpeg", None)  # nothing is decoded for a picture that the browser has
+        for und in (0, 1):
+            kept = ask(tags[und], und=und)
+            assert (kept.status_code, kept.content, kept.headers["ETag"]) == (304, b"", tags[und])
+    other = replace(Lens.ideal(SIZE, 150.0), distortion=np.array([-0.2, 0.0, 0.0, 0.0, 0.0]))
+    write_lens(workspace / "small" / "lens.yaml", other)
+    assert ask(tags[0]).status_code == 304
+    undistorted = ask(tags[1], und=1)
+    assert undistorted.status_code == 200
+    assert undistorted.content != answers[1].content
+    assert ask(tags[0], w=80).status_code == ask(tags[1]).status_code == 200
 
 
 def test_pictures_of_a_calibration_from_this_computer_are_shown_too(client: TestClient, workspace: Path) -> None:

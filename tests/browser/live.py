@@ -150,6 +150,17 @@ def ask(pages: str, path: str) -> Any:
         return json.load(answer)
 
 
+def edit_elsewhere(page: Page, pages: str, **changes: Any) -> None:
+    """Edit the project of a page as another window would."""
+    before = ask(pages, "")
+    body = {"project": before["project"] | changes, "revision": before["revision"], "label": "elsewhere"}
+    page.evaluate(
+        """([path, body]) => fetch(path, {method: "PUT", body: JSON.stringify(body),
+           headers: {"X-Rooftrack": "1", "Content-Type": "application/json"}})""",
+        [pages.replace("/p/", "/api/projects/"), body],
+    )
+
+
 def ask_bytes(pages: str, path: str) -> bytes:
     """Return a picture the server makes of a project, given the address of its pages."""
     with urllib.request.urlopen(f"{pages.replace('/p/', '/api/projects/')}/{path}") as answer:

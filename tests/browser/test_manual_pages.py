@@ -17,7 +17,7 @@ from playwright.sync_api import APIResponse, Page, Route, expect
 from core.lens import read_lens
 from core.project import read_project
 from tests.browser.hands import centre_of, fitted, zoomed
-from tests.browser.live import SAMPLE, arrived, ask, ask_bytes, eventually, watched
+from tests.browser.live import SAMPLE, arrived, ask, ask_bytes, edit_elsewhere, eventually, watched
 from tests.browser.steps import (
     FRAME_SIZE,
     draw_bands,
@@ -326,7 +326,53 @@ def test_clicks_on_the_undistorted_frame_are_stored_raw(browser, project):
         page.mouse.click(*np.round(lies.window(wanted)))
         expect(page.get_by_label("u", exact=True)).not_to_have_value("")
         stored = [float(page.get_by_label(name, exact=True).input_value()) for name in ("u", "v")]
+
+        def no_image(route: Route) -> None:
+            if route.request.post_data_json["from"] == "und":
+                route.fulfill(json={"points": [None]})
+            else:
+                route.continue_()
+
+        page.route("**/transform", no_image)
+        marks = page.locator("[data-id^='pair-']")
+        expect(marks).to_have_count(21)
+        page.mouse.click(*np.round(lies.window(wanted) + [60.0, 0.0]))
+        expect(page.get_by_role("status").filter(has_text="the lens has no image of this place")).to_be_visible()
+        expect(marks).to_have_count(21)
     assert np.array(stored) == pytest.approx(lens.distort(wanted), abs=CLICK_PX)
+
+
+def test_a_picture_that_comes_late_takes_no_newer_ones_place(browser, project):
+    _, pages = project
+    whole = "x".join(str(size) for size in FRAME_SIZE)
+    late: list[Route] = []
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions")
+        ready(page, "Reference frame"), ready(page, "Orthorectified")
+        page.route("**/frames/1.jpg", lambda route: late.append(route), times=1)
+        edit_elsewhere(page, pages, reference_frame=1)
+        answer = arrived(page, late)
+        edit_elsewhere(page, pages, reference_frame=3)
+        page.wait_for_timeout(1500)
+        answer.fulfill(body=ask_bytes(pages, "frames/1.jpg?w=160"), content_type="image/jpeg")
+        expect(page.locator(".pane-chip", has_text="Frame 3 · raw")).to_be_visible()
+        page.wait_for_timeout(500)
+        expect(pane(page, "Reference frame")).to_have_attribute("data-picture", whole)
+
+        plan = pane(page, "Orthorectified")
+        box = plan.bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        place = plan.locator(".pane-readout").inner_text()
+        late.clear()
+        page.route("**/rectified.jpg*", lambda route: late.append(route), times=1)
+        edit_elsewhere(page, pages, orthoimage=ask(pages, "")["project"]["orthoimage"] | {"pixel_size_m": 0.07})
+        answer = arrived(page, late)
+        page.mouse.move(box["x"] + box["width"] / 2 + 1, box["y"] + box["height"] / 2)
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        page.wait_for_timeout(200)
+        assert plan.locator(".pane-readout").inner_text() == place  # the raster belongs to the picture
+        answer.continue_()
+        ready(page, "Orthorectified")
 
 
 def test_points_go_to_qgis_and_come_back(browser, project, tmp_path):
@@ -789,6 +835,12 @@ def test_a_clicked_height_and_a_region_make_a_target_of_points(browser, project,
         page.mouse.click(*fitted(page, pane_of_ground, (grid["width"], grid["height"])).window(ortho_px(grid, place)))
         expect(page.locator("#height .value").first).to_contain_text("18.")
         page.get_by_role("button", name="Take this height").click()
+        saved(page)
+        wall = {"xyz_m": [*place, 9.0], "height_m": 9.0, "spread_m": None, "points": 1}
+        events = f"event: pick\ndata: {json.dumps(wall)}\n\n"  # a click into the 3D scene
+        page.route("**/events", lambda route: route.fulfill(body=events, content_type="text/event-stream"), times=1)
+        page.reload()
+        expect(page.locator("#height .value")).to_have_text(["9.00 m", "–"])
 
         page.goto(f"{pages}/regions?layout=plan")
         ready(page, "Orthorectified")

@@ -15,7 +15,7 @@ from core.drift import high_pass
 from core.project import read_project
 from core.results import read_history_csv
 from core.run import run_project
-from tests.browser.live import arrived, ask, eventually, free_port, serving, watched
+from tests.browser.live import arrived, ask, edit_elsewhere, eventually, free_port, serving, watched
 from tests.browser.steps import FRAME_SIZE
 
 FRAMES = 600
@@ -135,6 +135,42 @@ def test_an_answer_from_before_a_method_was_chosen_is_not_taken_for_the_new_one(
         page.wait_for_timeout(1000)
         expect(page.locator(".note.info")).to_contain_text("Not measured by this method yet")
         assert page.locator(".toast").all_inner_texts() == []
+
+
+def test_what_cannot_be_asked_is_told_and_asked_again_and_no_older_overlay_stays(browser, project):
+    _, pages = project
+    reviews: list[Route] = []
+    troubles = [
+        lambda route: route.abort(),
+        lambda route: route.fulfill(status=422, json={"error": {"message": "The summary is damaged."}}),
+    ]
+
+    def trouble_at_first(route: Route) -> None:
+        troubles.pop(0)(route) if troubles else route.continue_()
+
+    def hold_the_first(route: Route) -> None:
+        reviews.append(route)
+        if len(reviews) > 1:
+            route.continue_()
+
+    with watched(browser, pages) as page:
+        page.route("**/results", trouble_at_first)
+        page.route("**/inputs", lambda route: route.abort(), times=1)
+        page.route("**/review/30?*", hold_the_first)
+        page.goto(f"{pages}/review?frame=30")
+        expect(page.get_by_role("heading", name="The results cannot be shown")).to_be_visible()
+        expect(page.locator("#main")).to_contain_text(
+            "The summary is damaged."
+        )  # the server answers again, and refuses
+        page.get_by_role("button", name="Try again").click()
+        expect(page.get_by_role("heading", name="The video cannot be shown")).to_be_visible()
+        older = arrived(page, reviews)
+        with page.expect_response("**/results/roof*"):  # the page has begun to read everything again
+            edit_elsewhere(page, pages, excluded_frames=[[30, 30]])
+        older.continue_()
+        at_rest(page, 30)
+        eventually(lambda: len(reviews) > 1)
+        expect(page.get_by_label("This frame", exact=True)).to_contain_text("excluded")
 
 
 def test_a_failed_measurement_is_told_once_and_leads_to_its_remedy(browser, project):
@@ -400,6 +436,16 @@ def test_the_interval_of_rest_is_dragged_on_the_plot(browser, project):
         handle.press("Shift+ArrowLeft")
         expect(handle).to_have_attribute("aria-valuenow", f"{end - 1:.2f}")
         eventually(lambda: read_project(folder).intervals_s.pre_event[1] == pytest.approx(end - 1, abs=0.002))
+        before = read_project(folder).intervals_s
+        box = handle.bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 60)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 100, box["y"] + 60, steps=4)
+        expect(handle).not_to_have_attribute("aria-valuenow", f"{before.pre_event[1]:.2f}")
+        handle.dispatch_event("pointercancel", {"pointerId": 1})  # the system takes the drag over
+        page.mouse.up()
+        expect(handle).to_have_attribute("aria-valuenow", f"{before.pre_event[1]:.2f}")
+        assert read_project(folder).intervals_s == before
         field = page.get_by_role("textbox", name="Residual to")
         field.fill("500")
         field.press("Enter")
@@ -457,6 +503,26 @@ def test_table_2_says_what_the_summary_says(browser, headless, finished):
             ):
                 assert float(shown) == pytest.approx(100 * exact, abs=0.0051)
         expect(page.get_by_label("GPS", exact=True)).to_contain_text(f"{1000 * gps['rms_m']['x']:.1f}")
+
+
+def test_what_was_asked_of_one_target_is_not_shown_as_anothers(browser, finished):
+    validation = ask(finished, "validation?target=roof")
+    other = validation | {"table": [row | {"video_m": 0.1234} for row in validation["table"]]}
+    late: list[Route] = []
+    with watched(browser, finished) as page:
+        results = ask(finished, "results")
+        page.route("**/results", lambda route: route.fulfill(json=results | {"targets": ["roof", "annex"]}))
+        page.route("**/validation?target=roof*", lambda route: late.append(route))
+        page.route("**/validation?target=annex*", lambda route: route.fulfill(json=other))
+        page.goto(f"{finished}/export")
+        arrived(page, late)
+        page.get_by_role("radio", name="annex").click()
+        page.wait_for_timeout(500)
+        for route in late:
+            route.fulfill(json=validation)
+        expect(page.locator(".comparison tbody tr").first).to_contain_text("12.34")
+        page.wait_for_timeout(500)
+        expect(page.locator(".comparison tbody tr").first).to_contain_text("12.34")
 
 
 def test_a_result_from_before_a_change_says_so(browser, project):

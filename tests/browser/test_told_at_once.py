@@ -10,7 +10,7 @@ from playwright.sync_api import Page, expect
 
 from core.project import read_project
 from core.results import read_history_csv
-from tests.browser.live import SAMPLE, ask, eventually, free_port, serving, watched
+from tests.browser.live import SAMPLE, ask, edit_elsewhere, eventually, free_port, serving, watched
 from tests.browser.steps import ready, saved
 
 FRAMES = 600
@@ -73,14 +73,7 @@ def test_results_changed_by_another_window_are_marked_in_this_one(browser, measu
         page.goto(f"{pages}/drift")
         expect(page.locator(".warnings")).not_to_be_empty()
         expect(note(page)).to_have_count(0)
-        before = ask(pages, "")
-        document = before["project"] | {"excluded_frames": [[5, 6]]}
-        body = {"project": document, "revision": before["revision"], "label": "elsewhere"}
-        page.evaluate(
-            """([path, body]) => fetch(path, {method: "PUT", body: JSON.stringify(body),
-               headers: {"X-Rooftrack": "1", "Content-Type": "application/json"}})""",
-            [pages.split("/p/")[0] + "/api/projects/" + pages.split("/p/")[1], body],
-        )
+        edit_elsewhere(page, pages, excluded_frames=[[5, 6]])
         expect(note(page)).to_contain_text("the files are older", timeout=60_000)
 
 

@@ -186,7 +186,7 @@ const rangeText = ([first, last]) => (first === last ? `${first}` : `${first}–
 const rangeWords = (range) => `${range[0] === range[1] ? "frame" : "frames"} ${rangeText(range)}`;
 
 /** Ranges in order, those that touch made one. @param {Range[]} ranges @returns {Range[]} */
-export function merged(ranges) {
+function merged(ranges) {
   /** @type {Range[]} */
   const result = [];
   for (const [first, last] of [...ranges].sort((a, b) => a[0] - b[0])) {

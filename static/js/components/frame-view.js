@@ -22,6 +22,8 @@ const RESTS_AFTER_MS = 140;
 export class FrameView extends Emitter {
   #wanted = 0;
   #shown = "";
+  /** Counts the solutions, so that the overlay of one is not taken for that of the next. */
+  #solution = 0;
   #loading = false;
   #moved_ms = 0;
   #resting = 0;
@@ -101,7 +103,7 @@ export class FrameView extends Emitter {
   /** Read the overlay again: the results are others. */
   refresh() {
     this.library.forgetReviews();
-    this.#shown = "";
+    this.#solution += 1;
     void this.#load();
   }
 
@@ -119,11 +121,9 @@ export class FrameView extends Emitter {
   async #load() {
     if (this.#loading || !this.active) return;
     this.#loading = true;
-    try {
-      while (this.#shown !== this.#next().key) await this.#showOne(this.#next());
-    } catch (error) {
-      this.#shown = this.#next().key;
-      toastError(error);
+    for (let next = this.#next(); next.key !== this.#shown; next = this.#next()) {
+      await this.#showOne(next).catch(toastError);
+      this.#shown = next.key; // what cannot be shown is not asked for again and again
     }
     this.#loading = false;
     const steps = this.playing ? PREPARED_BY_PLAYING : PREPARED_BY_STEPPING;
@@ -134,8 +134,8 @@ export class FrameView extends Emitter {
     );
   }
 
-  /** @param {{frame: number, width: number | null, key: string}} next */
-  async #showOne({ frame, width, key }) {
+  /** @param {{frame: number, width: number | null}} next */
+  async #showOne({ frame, width }) {
     const measured = this.library.review(frame, this.method).catch((error) => this.#without(error));
     const image = await this.library.image(frame, width);
     // The first overlay may have to wait for the engine to solve; a picture of its own is better than none.
@@ -144,7 +144,6 @@ export class FrameView extends Emitter {
     const review = await measured;
     solved();
     this.pane.setImage(image);
-    this.#shown = key;
     this.review = review;
     this.#showOverlay();
     this.#setLoupe();
@@ -166,7 +165,7 @@ export class FrameView extends Emitter {
   #next() {
     const moving = this.playing || performance.now() - this.#moved_ms < RESTS_AFTER_MS;
     const width = moving ? this.#playWidth() : null;
-    return { frame: this.#wanted, width, key: `${this.#wanted}/${width ?? ""}/${this.method}` };
+    return { frame: this.#wanted, width, key: `${this.#wanted}/${width ?? ""}/${this.method}/${this.#solution}` };
   }
 
   /** Width that fills the pane, in steps so that a resized window still finds its pictures. @returns {number} px */

@@ -1,12 +1,11 @@
 // Pages that show results wait here until there are any.
 
-import { get, projectPath } from "../lib/api.js";
+import { get, isOffline, projectPath, sentence, untilNextTry } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
 import { told } from "../lib/problems.js";
 import { stepUrl } from "./header.js";
 import { fetchResults } from "./histories.js";
-import { toastError } from "./toast.js";
 
 /** @typedef {import("./histories.js").Results} Results */
 
@@ -21,10 +20,10 @@ export async function whenMeasured(page, what, { byMethod = false } = {}) {
   const main = find("#main");
   const layout = main.className;
   for (;;) {
-    const results = await fetchResults(page.id).catch((error) => (toastError(error), null));
+    const results = await answered("The results cannot be shown", () => fetchResults(page.id));
     const { method } = page.store.project;
-    const other = byMethod && results?.ready && !results.methods.includes(method);
-    if (results?.ready && !other) {
+    const other = byMethod && results.ready && !results.methods.includes(method);
+    if (results.ready && !other) {
       main.className = layout;
       return results;
     }
@@ -48,7 +47,7 @@ export async function whenVideo(page, what) {
   const main = find("#main");
   const layout = main.className;
   for (;;) {
-    const { video } = await get(projectPath(page.id, "inputs"));
+    const { video } = await answered("The video cannot be shown", () => get(projectPath(page.id, "inputs")));
     if (video && !video.error) {
       main.className = layout;
       return video;
@@ -58,6 +57,34 @@ export async function whenVideo(page, what) {
     fill(main, emptyState("The video cannot be shown", why + what, stepButton(page.id, "inputs")));
     await new Promise((resolve) => page.events.on("inputs", resolve));
   }
+}
+
+/**
+ * What the server answers, however often it has to be asked; meanwhile the page says why it shows nothing.
+ * @template Answer
+ * @param {string} title
+ * @param {() => Promise<Answer>} ask
+ * @returns {Promise<Answer>}
+ */
+async function answered(title, ask) {
+  for (;;) {
+    try {
+      return await ask();
+    } catch (error) {
+      await untilWorthAsking(title, error);
+    }
+  }
+}
+
+/** A server that did not answer may be back soon; one that refused is asked again when the person wants it. @param {string} title @param {unknown} error @returns {Promise<unknown>} */
+function untilWorthAsking(title, error) {
+  const main = find("#main");
+  main.className = "page";
+  return new Promise((resolve) => {
+    const again = h("button", { class: "button primary", type: "button", onclick: resolve }, "Try again");
+    fill(main, emptyState(title, sentence(error), again));
+    if (isOffline(error)) void untilNextTry().then(resolve);
+  });
 }
 
 /** @param {string} title @param {string} what @param {HTMLElement} remedy */

@@ -20,7 +20,7 @@ import { bindKeys } from "../lib/keys.js";
 import { fill, find, h } from "../lib/dom.js";
 import { isConflict, sentence } from "../lib/api.js";
 import { plural } from "../lib/format.js";
-import { projectHeader, projectsHeader, STEPS, tellConnection } from "./header.js";
+import { projectHeader, projectsHeader, tellConnection } from "./header.js";
 import { toast, toastError } from "./toast.js";
 
 /** @typedef {import("../lib/types.js").StepName} StepName */
@@ -47,9 +47,6 @@ export async function openPage(step) {
     return new Promise(() => undefined); // the page goes no further
   }
 }
-
-/** The step after this one, for a button at the end of a page. @param {StepName} step */
-export const nextStep = (step) => STEPS[STEPS.findIndex((entry) => entry.step === step) + 1] ?? null;
 
 /** @param {ProjectStore} store @returns {import("../lib/keys.js").KeyBinding[]} */
 function historyKeys(store) {

@@ -15,7 +15,7 @@ const arrowsWith = (prefix) =>
     .join(" / ");
 
 /** Direction of an arrow key: u right, v down. @param {KeyboardEvent} event */
-export const arrowDirection = (event) => DIRECTIONS[event.key];
+const arrowDirection = (event) => DIRECTIONS[event.key];
 
 /** The pane with the focus, else the one under the pointer, else the one used last. @param {Pane[]} panes */
 export const activePane = (panes) =>

@@ -187,7 +187,7 @@ const transportIcon = (path) =>
   svg("svg", { class: "icon", viewBox: "0 0 16 16", "aria-hidden": "true" }, svg("path", { d: path }));
 
 /** @param {string} status */
-export const isDoubtful = (status) => status === "weak" || status === "lost";
+const isDoubtful = (status) => status === "weak" || status === "lost";
 
 /** Index of the ascending value closest to another. @param {number[]} values @param {number} wanted */
 export function nearest(values, wanted) {

@@ -186,7 +186,7 @@ export class IntervalHandles {
     this.plot = plot;
     this.layer = h("div", { class: "plot-handles" });
     /** @type {Map<string, End>} */ this.handles = new Map();
-    /** What the pointer may have hold of, and since where. @type {{ends: End[], px: number} | null} */ this.held = null;
+    /** What the pointer may have hold of, since where, and what it may change. @type {{ends: End[], px: number, intervals: Interval[]} | null} */ this.held = null;
   }
 
   place() {
@@ -230,7 +230,7 @@ export class IntervalHandles {
       event.stopPropagation();
       event.preventDefault();
       handle.setPointerCapture(event.pointerId);
-      this.held = { ends: this.endsAt(event.clientX), px: event.clientX };
+      this.held = { ends: this.endsAt(event.clientX), px: event.clientX, intervals: this.plot.intervals };
       this.held.ends[0]?.handle.focus();
     });
     handle.addEventListener("pointermove", (event) => {
@@ -245,6 +245,11 @@ export class IntervalHandles {
       const taken = this.takenBy(event.clientX);
       if (taken) this.move(taken.key, taken.end, this.value(taken.key, taken.end), true);
       this.held = null;
+    });
+    // The browser or the system has taken the drag over, so nobody meant where it is now.
+    handle.addEventListener("pointercancel", (event) => {
+      event.stopPropagation();
+      this.putBack();
     });
     handle.addEventListener("keydown", (event) => this.key(event, key, end));
     this.layer.append(handle);
@@ -272,6 +277,16 @@ export class IntervalHandles {
     if (ends.length > 1) taken?.handle.focus();
     this.held.ends = taken ? [taken] : [];
     return taken;
+  }
+
+  /** Let go as if nothing had been moved. */
+  putBack() {
+    if (this.held === null) return;
+    const { ends, intervals } = this.held;
+    this.held = null;
+    this.plot.setIntervals(intervals);
+    for (const { key, from, to } of intervals)
+      if (ends.some((end) => end.key === key)) this.plot.emit("interval", { key, from, to, done: false });
   }
 
   /** @param {KeyboardEvent} event @param {string} key @param {"from"|"to"} end */

@@ -15,7 +15,7 @@ import { projectPath, TRIES_AGAIN_MS } from "./api.js";
  * @property {{ready: boolean}} orthoimage
  * @property {object} results
  * @property {any} track
- * @property {{xyz_m?: [number, number, number], height_m?: number, spread_m?: number, points?: number, message?: string}} pick
+ * @property {{xyz_m?: [number, number, number], height_m?: number, spread_m?: number | null, points?: number, message?: string}} pick
  * @property {{owner: string | null, frame?: number | null}} scene which project the 3D view holds now
  * @property {null} offline the server does not answer
  * @property {null} online it answers again

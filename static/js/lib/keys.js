@@ -24,7 +24,7 @@ export const keyTable = () => table;
 const isMac = navigator.platform.startsWith("Mac");
 
 /** Canonical name of what was pressed, as in the table. @param {KeyboardEvent} event */
-export function keyName(event) {
+function keyName(event) {
   const command = event.ctrlKey || event.metaKey;
   const printable = event.key.length === 1 && event.key !== " ";
   const shift = event.shiftKey && (!printable || /[a-z]/i.test(event.key));

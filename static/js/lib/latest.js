@@ -8,14 +8,14 @@ import { isOffline, untilNextTry } from "./api.js";
  * @param {(argument: Argument) => Promise<Result>} ask
  * @param {(result: Result, argument: Argument) => void} onAnswer
  * @param {(error: unknown) => void} onError
- * @returns {(argument: Argument) => void}
+ * @returns {(argument: Argument) => Promise<void>} resolves when the newest question is answered
  */
 export function latest(ask, onAnswer, onError) {
-  let busy = false;
+  /** @type {Promise<void> | null} */
+  let busy = null;
   /** @type {{argument: Argument} | null} */
   let waiting = null;
   const next = async (/** @type {Argument} */ argument) => {
-    busy = true;
     try {
       const result = await ask(argument);
       if (waiting === null) onAnswer(result, argument);
@@ -25,13 +25,18 @@ export function latest(ask, onAnswer, onError) {
         waiting ??= { argument };
       } else if (waiting === null) onError(error);
     }
-    busy = false;
-    const newest = waiting;
-    waiting = null;
-    if (newest !== null) void next(/** @type {{argument: Argument}} */ (newest).argument);
+  };
+  const askAll = async () => {
+    await null; // so that `busy` is set before it can be over
+    while (waiting !== null) {
+      const { argument } = waiting;
+      waiting = null;
+      await next(argument);
+    }
+    busy = null;
   };
   return (argument) => {
-    if (busy) waiting = { argument };
-    else void next(argument);
+    waiting = { argument };
+    return (busy ??= askAll());
   };
 }

@@ -27,7 +27,7 @@ export function setView(values) {
   timer = window.setTimeout(flushView, 200); // browsers refuse more than some hundred changes in half a minute
 }
 
-export function flushView() {
+function flushView() {
   const query = new URLSearchParams(location.search);
   for (const [name, value] of Object.entries(waiting)) {
     if (value === null || value === "") query.delete(name);

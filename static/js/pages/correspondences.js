@@ -306,61 +306,68 @@ void get(projectPath(page.id, "inputs")).then(({ video }) => (lastFrame = (video
 /** @param {string} path @param {PairPane} side */
 const loadImage = (path, side) => PaneImage.load(`/api/${path}`, { onLevel: () => side.pane.invalidate() });
 
-async function loadFrame() {
-  const wanted = undistorted;
+const askFrame = latest(
+  (/** @type {{number: number, und: boolean}} */ { number, und }) =>
+    loadImage(projectPath(page.id, `frames/${number}.jpg`, { und: und ? 1 : 0 }), frame),
+  showFrame,
+  (error) => frame.chrome.setNote(...noteContent(error, page)),
+);
+const askOrtho = latest(fetchOrtho, showOrtho, (error) => ortho.chrome.setNote(...noteContent(error, page)));
+
+/** What the picture of the frame is made of. @param {import("../lib/types.js").Project} project */
+const shownOf = ({ reference_frame, inputs }) => JSON.stringify([reference_frame, inputs.video, inputs.lens]);
+
+function loadFrame() {
   if (frame.pane.image === null) frame.chrome.setNote("Loading the frame…");
-  try {
-    const image = await loadImage(
-      projectPath(page.id, `frames/${store.project.reference_frame}.jpg`, { und: wanted ? 1 : 0 }),
-      frame,
-    );
-    if (wanted !== undistorted) return;
-    frame.mapping = wanted ? undistortion(transform) : identity;
-    frame.pane.setImage(image);
-    frame.chrome.setTitle(`Frame ${store.project.reference_frame} · ${wanted ? "undistorted" : "raw"}`);
-    frame.chrome.setNote();
-    frame.refresh();
-    void findGhosts();
-  } catch (error) {
-    frame.chrome.setNote(...noteContent(error, page));
-  }
+  return askFrame({ number: store.project.reference_frame, und: undistorted });
 }
 
-async function loadOrtho() {
+/** @param {PaneImage} image @param {{number: number, und: boolean}} shown */
+function showFrame(image, { number, und }) {
+  frame.mapping = und ? undistortion(transform) : identity;
+  frame.pane.setImage(image);
+  frame.chrome.setTitle(`Frame ${number} · ${und ? "undistorted" : "raw"}`);
+  frame.chrome.setNote();
+  frame.refresh();
+  void findGhosts();
+}
+
+function loadOrtho() {
   if (ortho.pane.image === null) ortho.chrome.setNote("Loading the orthoimage…");
-  try {
-    const answer = await get(projectPath(page.id, "orthoimage"));
-    grid = answer.grid;
-    if (!answer.ready) {
-      if (store.project.inputs.cloud === null)
-        ortho.chrome.setNote(
-          "This project has no point cloud. Click the frame and type the ground coordinates on the right, or choose a cloud.",
-          stepButton(page.id, "inputs", "Choose a point cloud"),
-        );
-      else
-        ortho.chrome.setNote(
-          "There is no orthoimage yet.",
-          stepButton(page.id, "orthoimage", "Make the orthoimage"),
-        );
-      return;
-    }
-    const here = answer.grid;
-    ortho.mapping = {
-      shown: (points) => points.map((point) => orthoFromWorld(here, point)),
-      stored: (point) => worldFromOrtho(here, point),
-    };
-    ortho.pane.setImage(
-      await loadImage(
-        projectPath(page.id, "orthoimage.png", { v: `${here.west_m},${here.north_m},${here.pixel_size_m}` }),
-        ortho,
-      ),
+  return askOrtho(null);
+}
+
+/** The raster and the picture on it; no picture where none is made. @returns {Promise<{raster: OrthoGrid, image: PaneImage} | null>} */
+async function fetchOrtho() {
+  const { ready, grid: raster } = await get(projectPath(page.id, "orthoimage"));
+  if (!ready) return null;
+  const v = `${raster.west_m},${raster.north_m},${raster.pixel_size_m}`;
+  return { raster, image: await loadImage(projectPath(page.id, "orthoimage.png", { v }), ortho) };
+}
+
+/** @param {{raster: OrthoGrid, image: PaneImage} | null} made */
+function showOrtho(made) {
+  grid = made?.raster ?? null;
+  if (made === null) return showNoOrtho();
+  const { raster, image } = made;
+  ortho.mapping = {
+    shown: (points) => points.map((point) => orthoFromWorld(raster, point)),
+    stored: (point) => worldFromOrtho(raster, point),
+  };
+  ortho.pane.setImage(image);
+  ortho.chrome.setNote();
+  ortho.refresh();
+  showFit();
+}
+
+function showNoOrtho() {
+  if (store.project.inputs.cloud === null)
+    ortho.chrome.setNote(
+      "This project has no point cloud. Click the frame and type the ground coordinates on the right, or choose a cloud.",
+      stepButton(page.id, "inputs", "Choose a point cloud"),
     );
-    ortho.chrome.setNote();
-    ortho.refresh();
-    showFit();
-  } catch (error) {
-    ortho.chrome.setNote(...noteContent(error, page));
-  }
+  else
+    ortho.chrome.setNote("There is no orthoimage yet.", stepButton(page.id, "orthoimage", "Make the orthoimage"));
 }
 
 // --- keys
@@ -450,10 +457,8 @@ slots.on("change", () => {
 });
 store.on("change", ({ project, previous, origin }) => {
   sides.forEach((side) => side.refresh());
-  if (project.reference_frame !== previous.reference_frame) {
-    referenceFrame.set(project.reference_frame);
-    void loadFrame();
-  }
+  if (project.reference_frame !== previous.reference_frame) referenceFrame.set(project.reference_frame);
+  if (shownOf(project) !== shownOf(previous)) void loadFrame();
   if (origin === "edit" || JSON.stringify(project.correspondences) !== JSON.stringify(previous.correspondences))
     askFit(project.correspondences);
   if (origin === "saved") {
@@ -464,6 +469,7 @@ store.on("change", ({ project, previous, origin }) => {
     announce(`${plural(project.correspondences.length, "pair")} placed`);
 });
 page.events.on("orthoimage", () => void loadOrtho());
+page.events.on("inputs", ({ kind }) => ["video", "lens"].includes(kind) && void loadFrame());
 
 askFit(store.project.correspondences);
 await Promise.all([loadFrame(), loadOrtho()]);

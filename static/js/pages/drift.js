@@ -20,6 +20,7 @@ import { Solver } from "../components/solver.js";
 import { toastError } from "../components/toast.js";
 
 /** @typedef {import("../components/histories.js").History} History */
+/** @typedef {import("../components/histories.js").Results} Results */
 /** @typedef {import("../components/interval-fields.js").IntervalName} IntervalName */
 /** @typedef {{dx: (number | null)[], dy: (number | null)[]}} Pair */
 /** @typedef {{dx: number, dy: number}} Rms */
@@ -146,6 +147,7 @@ const spectrumPlot = new Plot(lowerArea, {
 const filtering = h("span", { class: "badge accent", role: "status", hidden: true }, "Solving…");
 solving.before(filtering);
 const fields = intervalFields(intervalBox, saveInterval, end_s);
+const load = latest(askResults, showResults, showProblem);
 const refilter = latest(askFilter, showAnswer, showProblem);
 const resweep = latest(askSweep, showSweep, (error) => showSweepProblem(error));
 const respectrum = latest(askSpectra, showSpectra, () => undefined);
@@ -164,8 +166,8 @@ sweepPlot.on("seek", ({ x }) =>
   typeCorner(Math.min(Math.max(Math.round(x / CORNER_STEP_HZ) * CORNER_STEP_HZ, LOWEST_HZ), HIGHEST_HZ)),
 );
 store.on("change", onProject);
-page.events.on("results", () => void reload().catch(toastError));
-page.events.on("online", () => void reload().catch(toastError));
+page.events.on("results", () => void reload());
+page.events.on("online", () => void reload());
 page.keys([
   {
     keys: "ArrowLeft / [",
@@ -205,7 +207,7 @@ onProject();
 const nothing = h("p", { hidden: true });
 mainArea.append(h("div", { class: "stage-empty", role: "status" }, nothing));
 const opened = busyOver(mainArea, "Solving…");
-await reload().catch(toastError);
+await reload();
 
 function stageElement() {
   return h(
@@ -273,11 +275,22 @@ function sideElement() {
 }
 
 /** Everything that depends on results. */
-async function reload() {
-  results = await fetchResults(page.id);
+function reload() {
+  return load(target);
+}
+
+/** @param {string} of a target @returns {Promise<{newest: Results, curve: History | null}>} */
+async function askResults(of) {
+  const newest = await fetchResults(page.id);
+  const hasCurve = newest.methods.includes("geometric");
+  return { newest, curve: hasCurve ? await fetchHistory(page.id, of, "geometric").catch(() => null) : null };
+}
+
+/** @param {{newest: Results, curve: History | null}} answered */
+function showResults({ newest, curve }) {
+  results = newest;
+  geometric = curve;
   earlier.show(results, { method: store.project.method, isEarlier: answer?.is_earlier ?? false });
-  if (results.methods.includes("geometric"))
-    geometric = await fetchHistory(page.id, target, "geometric").catch(() => null);
   ask();
 }
 
@@ -618,5 +631,7 @@ function choosePoint(wanted) {
 function chooseTarget(wanted) {
   target = wanted;
   setView({ target: wanted });
-  void reload().catch(toastError);
+  geometric = null;
+  filterAnew();
+  void reload();
 }

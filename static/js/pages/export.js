@@ -4,6 +4,7 @@ import { get, post, projectPath, sentence } from "../lib/api.js";
 import { fill, find, h } from "../lib/dom.js";
 import { centimetres, fixed, millimetres, milliseconds, plural, seconds, size } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
+import { latest } from "../lib/latest.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { busyOver } from "../components/busy.js";
 import { fromBefore } from "../components/earlier-note.js";
@@ -19,9 +20,11 @@ import { toast, toastError } from "../components/toast.js";
 
 /** @typedef {import("../components/histories.js").History} History */
 /** @typedef {import("../components/histories.js").ResultFile} ResultFile */
+/** @typedef {import("../components/histories.js").Results} Results */
 /** @typedef {{time_s: number[], dx_m: (number | null)[], dy_m: (number | null)[]}} Curve */
 /** @typedef {"peak_positive" | "peak_negative" | "residual"} Quantity */
 /** @typedef {{quantity: Quantity, axis: "x" | "y", video_m: number, gps_m: number, error_m: number, error_percent: number | null, video_at_gps_m?: number | null, error_at_gps_m?: number | null}} TableRow */
+/** @typedef {{validation: Validation | null, history: History | null, problem: string}} Curves of a target */
 /** @typedef {{gps: Curve | null, video: Curve, error: Curve | null, lag_s: number | null, lag_sigma_s?: number | null, rms_m: {x: number, y: number} | null, table: TableRow[], message: string, is_coarse?: boolean, spacing?: string}} Validation */
 
 /** @type {{name: Quantity, title: string}[]} */
@@ -93,10 +96,12 @@ fill(
 const overlay = new Plot(overlayBox, { title: "Displacement", unit: "m", link: "export", drag: "view" });
 const errorPlot = new Plot(errorBox, { title: "Video less GPS", unit: "m", link: "export", drag: "view" });
 const reportJob = jobCard();
+const reload = latest(askResults, showResults, toastError);
+const loadCurves = latest(askCurves, showCurves, toastError);
 
-page.events.on("results", () => void reload().catch(toastError));
-page.events.on("online", () => void reload().catch(toastError));
-page.store.on("change", ({ origin }) => origin === "undo" && void reload().catch(toastError));
+page.events.on("results", () => void reload(null));
+page.events.on("online", () => void reload(null));
+page.store.on("change", ({ origin }) => origin === "undo" && void reload(null));
 page.events.on("job", onJob);
 page.keys([
   { keys: "A", group: "Validate", label: "East or north", run: () => chooseAxis(axis === "x" ? "y" : "x") },
@@ -110,16 +115,17 @@ page.keys([
   { keys: "Wheel", group: "Plots", label: "Zoom in time; a drag pans, a double click shows all" },
 ]);
 showArchive();
-await reload().catch(toastError);
+void reload(null);
 
-/** What the files say comes first; the curves follow, since the engine may have to solve for them. */
-async function reload() {
-  const done = busyOver(overlayBox, "Reading the results…");
-  results = await fetchResults(page.id).finally(done);
-  problem = "";
+function askResults() {
+  return fetchResults(page.id).finally(busyOver(overlayBox, "Reading the results…"));
+}
+
+/** What the files say comes first; the curves follow, since the engine may have to solve for them. @param {Results} newest */
+function showResults(newest) {
+  results = newest;
   showAll();
-  await loadCurves();
-  showAll();
+  void loadCurves(target);
 }
 
 /** Whether only the result from before a change can be shown: nothing has been measured as the project stands now. */
@@ -127,17 +133,26 @@ function isFromBefore() {
   return results.stale && !results.measured.includes(page.store.project.method);
 }
 
-async function loadCurves() {
+/** @param {string} of a target @returns {Promise<Curves>} */
+async function askCurves(of) {
   const { inputs, drift } = page.store.project;
   const done = busyOver(overlayBox, "Solving for the curves…");
   const corner_hz = drift.filter === "high-pass" ? drift.corner_hz : null;
   const method = isFromBefore() ? results.summary?.method : undefined;
-  const noted = (/** @type {unknown} */ error) => ((problem ||= sentence(error)), null);
-  validation = history = null;
+  /** @type {Curves} */
+  const found = { validation: null, history: null, problem: "" };
+  const noted = (/** @type {unknown} */ error) => ((found.problem ||= sentence(error)), null);
   if (inputs.gps !== null && !isFromBefore())
-    validation = await get(projectPath(page.id, "validation", { target, corner_hz })).catch(noted);
-  if (validation === null) history = await fetchHistory(page.id, target, method).catch(noted);
+    found.validation = await get(projectPath(page.id, "validation", { target: of, corner_hz })).catch(noted);
+  if (found.validation === null) found.history = await fetchHistory(page.id, of, method).catch(noted);
   done();
+  return found;
+}
+
+/** @param {Curves} newest */
+function showCurves(newest) {
+  ({ validation, history, problem } = newest);
+  showAll();
 }
 
 function showAll() {
@@ -548,7 +563,7 @@ function onJob(job) {
   reportJob.show(job);
   if (isRunning(job)) return;
   if (job.state === "done") toast("Files and report are ready.", { tone: "good" });
-  void reload().catch(toastError);
+  void reload(null);
 }
 
 /** @param {string} wanted */
@@ -563,5 +578,6 @@ function chooseAxis(wanted) {
 function chooseTarget(wanted) {
   target = wanted;
   setView({ target: wanted });
-  void reload().catch(toastError);
+  showCurves({ validation: null, history: null, problem: "" });
+  void loadCurves(target);
 }

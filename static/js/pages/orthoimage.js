@@ -103,7 +103,7 @@ pane.on("click", async ({ point }) => {
 });
 page.events.on("pick", ({ xyz_m, height_m, spread_m, points, message }) => {
   if (xyz_m && height_m !== undefined)
-    heights.show({ place_m: xyz_m, height_m, spread_m: spread_m ?? 0, points: points ?? 0 });
+    heights.show({ place_m: xyz_m, height_m, spread_m: spread_m ?? null, points: points ?? 0 });
   else heights.refuse(message ?? "The click met nothing of the cloud.");
 });
 
@@ -243,7 +243,7 @@ async function load() {
     showRaster(answer);
     showSettings();
     if (answer.job) showJob(answer.job);
-    if (answer.ready) await showPicture(answer);
+    if (answer.ready) await showPicture();
     else if (store.project.inputs.cloud === null)
       chrome.setNote("This project has no point cloud.", stepButton(page.id, "inputs", "Choose a point cloud"));
     else chrome.setNote("There is no orthoimage yet: choose pixel and extent on the right, and make it.");
@@ -252,9 +252,8 @@ async function load() {
   }
 }
 
-/** @param {{made_s?: number}} answer */
-async function showPicture(answer) {
-  const url = `/api/${projectPath(page.id, "orthoimage.png", { v: JSON.stringify([grid, answer.made_s ?? madeTimes]) })}`;
+async function showPicture() {
+  const url = `/api/${projectPath(page.id, "orthoimage.png", { v: JSON.stringify([grid, madeTimes]) })}`;
   if (url === loaded) return;
   if (pane.image === null) chrome.setNote("Loading the orthoimage…");
   pane.setImage(await PaneImage.load(url, { onLevel: () => pane.invalidate() }));

@@ -316,20 +316,24 @@ page.keys([
 
 // --- pictures
 
-async function loadFrame() {
-  if (framePane.image === null) frameChrome.setNote("Loading the frame…");
-  try {
-    framePane.setImage(
-      await PaneImage.load(`/api/${projectPath(page.id, `frames/${store.project.reference_frame}.jpg`)}`, {
-        onLevel: () => framePane.invalidate(),
-      }),
-    );
-    frameChrome.setTitle(`Frame ${store.project.reference_frame} · raw`);
+/** @param {string} path @param {Pane} pane */
+const loadImage = (path, pane) => PaneImage.load(`/api/${path}`, { onLevel: () => pane.invalidate() });
+
+const askFrame = latest(
+  (/** @type {number} */ number) => loadImage(projectPath(page.id, `frames/${number}.jpg`), framePane),
+  (image, number) => {
+    framePane.setImage(image);
+    frameChrome.setTitle(`Frame ${number} · raw`);
     frameChrome.setNote();
     draw();
-  } catch (error) {
-    frameChrome.setNote(...noteContent(error, page));
-  }
+  },
+  (error) => frameChrome.setNote(...noteContent(error, page)),
+);
+const askPlan = latest(fetchPlan, showPlan, (error) => planChrome.setNote(...noteContent(error, page)));
+
+function loadFrame() {
+  if (framePane.image === null) frameChrome.setNote("Loading the frame…");
+  return askFrame(store.project.reference_frame);
 }
 
 /** The colour around both pictures, as six hexadecimal digits. */
@@ -338,32 +342,38 @@ function surround() {
   return [red, green, blue].map((level) => (level ?? 0).toString(16).padStart(2, "0")).join("");
 }
 
-async function loadPlan() {
+function loadPlan() {
   if (planPane.image === null) planChrome.setNote("Laying the frame on the ground…");
-  try {
-    const answer = await get(projectPath(page.id, "rectified"));
-    if (!answer.ready) {
-      const { words, step } = told(answer.message);
-      planChrome.setNote(
-        words,
-        step === "inputs"
-          ? stepButton(page.id, "inputs")
-          : stepButton(page.id, "correspondences", "Place correspondences"),
-      );
-      return;
-    }
-    grid = answer.grid;
-    planPane.setImage(
-      await PaneImage.load(`/api/${projectPath(page.id, "rectified.jpg", { v: store.revision, outside: surround() })}`, {
-        onLevel: () => planPane.invalidate(),
-      }),
-    );
-    planChrome.setNote();
-    draw();
-    refreshPreview();
-  } catch (error) {
-    planChrome.setNote(...noteContent(error, page));
-  }
+  return askPlan(null);
+}
+
+/** The raster and the picture on it, or why there is none. @returns {Promise<{raster: OrthoGrid, image: PaneImage} | {message: string}>} */
+async function fetchPlan() {
+  const { ready, message, grid: raster } = await get(projectPath(page.id, "rectified"));
+  if (!ready) return { message };
+  const path = projectPath(page.id, "rectified.jpg", { v: store.revision, outside: surround() });
+  return { raster, image: await loadImage(path, planPane) };
+}
+
+/** @param {{raster: OrthoGrid, image: PaneImage} | {message: string}} answer */
+function showPlan(answer) {
+  if ("message" in answer) return showNoPlan(answer.message);
+  grid = answer.raster;
+  planPane.setImage(answer.image);
+  planChrome.setNote();
+  draw();
+  refreshPreview();
+}
+
+/** @param {string} message */
+function showNoPlan(message) {
+  const { words, step } = told(message);
+  planChrome.setNote(
+    words,
+    step === "inputs"
+      ? stepButton(page.id, "inputs")
+      : stepButton(page.id, "correspondences", "Place correspondences"),
+  );
 }
 
 async function findCamera() {
@@ -378,7 +388,7 @@ store.on("change", ({ project, previous }) => {
     JSON.stringify([previous.correspondences, previous.orthoimage, previous.inputs]);
   if (project.reference_frame !== previous.reference_frame) void loadFrame();
   if (rectifiedAnew) void findCamera().catch(toastError);
-  if (rectifiedAnew || project.reference_frame !== previous.reference_frame) void loadPlan().catch(toastError);
+  if (rectifiedAnew || project.reference_frame !== previous.reference_frame) void loadPlan();
 });
 page.events.on("orthoimage", () => void loadPlan());
 

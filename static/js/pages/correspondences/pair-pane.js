@@ -3,7 +3,7 @@
 import { Pane } from "../../components/pane.js";
 import { Loupe } from "../../components/loupe.js";
 import { paneChrome } from "../../components/pane-chrome.js";
-import { toast } from "../../components/toast.js";
+import { toast, toastError } from "../../components/toast.js";
 import { add, distance, times } from "../../lib/coordinates.js";
 import { Emitter } from "../../lib/emitter.js";
 import { fixed } from "../../lib/format.js";
@@ -18,10 +18,10 @@ import { otherSide } from "./slots.js";
 
 /**
  * How what is stored (raw px, or metres on the ground) relates to px of the picture shown. Promises where the server
- * must be asked (the undistorted picture).
+ * must be asked (the undistorted picture); it knows no place, null, where the lens has no image of one.
  * @typedef {object} Mapping
- * @property {(stored: Point[]) => Point[] | Promise<Point[]>} shown
- * @property {(shown: Point) => Point | Promise<Point>} stored
+ * @property {(stored: Point[]) => Point[] | Promise<(Point | null)[]>} shown
+ * @property {(shown: Point) => Point | Promise<Point | null>} stored
  */
 
 export const ARROW_PX = 26; // CSS px for a residual of one px of the video
@@ -112,9 +112,10 @@ export class PairPane extends Emitter {
     const entries = [...this.slots.pairs, ...this.slots.halves].filter((entry) => entry[this.side] !== null);
     const ids = entries.map((entry) => entry.id);
     const ask = (this.#asked += 1);
-    const take = (/** @type {Point[]} */ points) => {
+    const take = (/** @type {(Point | null)[]} */ points) => {
       if (ask !== this.#asked || this.pane.isDragging) return;
-      this.shown = new Map(points.map((point, i) => [ids[i], point]));
+      this.shown = new Map();
+      points.forEach((point, i) => point !== null && this.shown.set(ids[i], point));
       this.draw();
     };
     const answer = this.mapping.shown(entries.map((entry) => /** @type {Point} */ (entry[this.side])));
@@ -245,9 +246,17 @@ export class PairPane extends Emitter {
   /** In the order made, though the server may have to be asked. @param {Point} shown @param {(stored: Point) => void} use */
   #store(shown, use) {
     const stored = this.mapping.stored(shown);
-    if (stored instanceof Promise)
-      this.#nudges = this.#nudges.then(async () => use(await stored)).catch(() => this.refresh());
-    else use(stored);
+    if (!(stored instanceof Promise)) return use(stored);
+    const place = async () => {
+      const found = await stored;
+      if (found !== null) return use(found);
+      toast("Nothing was placed: the lens has no image of this place. Choose one nearer to the middle of the picture.");
+      this.refresh();
+    };
+    this.#nudges = this.#nudges.then(place).catch((error) => {
+      toastError(error);
+      this.refresh();
+    });
   }
 
   /** @param {boolean} aims */

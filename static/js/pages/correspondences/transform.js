@@ -18,10 +18,8 @@ export const transformer = (projectId) => async (from, to, points) => {
  * @returns {import("./pair-pane.js").Mapping}
  */
 export function undistortion(transform) {
-  const lead = async (/** @type {FrameName} */ from, /** @type {FrameName} */ to, /** @type {Point[]} */ points) =>
-    (await transform(from, to, points)).map((point, i) => point ?? points[i]);
   return {
-    shown: (points) => lead("raw", "und", points),
-    stored: async (point) => (await lead("und", "raw", [point]))[0],
+    shown: (points) => transform("raw", "und", points),
+    stored: async (point) => (await transform("und", "raw", [point]))[0],
   };
 }

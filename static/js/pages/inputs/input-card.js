@@ -174,7 +174,7 @@ export async function sendWithProgress(place, path, file) {
 }
 
 /** Files dropped on an element. @param {HTMLElement} element @param {(files: File[]) => void} take */
-export function acceptDrops(element, take) {
+function acceptDrops(element, take) {
   element.addEventListener("dragover", (event) => {
     event.preventDefault();
     element.classList.add("dropping");

@@ -5,7 +5,7 @@ import { fixed, metres, millimetres, plural } from "../../lib/format.js";
 import { icon } from "../../lib/icons.js";
 import { note } from "../../components/notes.js";
 
-/** @typedef {{place_m: number[], height_m: number, spread_m: number, points: number}} Height */
+/** @typedef {{place_m: number[], height_m: number, spread_m: number | null, points: number}} Height spread_m: null where only the clicked point itself is that high */
 /** @typedef {import("../../lib/targets.js").Targets} Targets */
 
 const NEW = "";
@@ -79,10 +79,13 @@ function reading({ place_m: [x, y], height_m, spread_m, points }) {
       "div",
       { class: "figures" },
       figure(metres(height_m), "above the ground"),
-      figure(`± ${millimetres(spread_m, 0)}`, `spread of ${plural(points, "point")}`),
+      spread_m === null
+        ? figure("–", "no spread: one point below the upper surface")
+        : figure(`± ${millimetres(spread_m, 0)}`, `spread of ${plural(points, "point")}`),
     ),
     h("p", { class: "small faint number" }, `at ${fixed(x, 2)}, ${fixed(y, 2)} m`),
-    spread_m > UNEVEN_M &&
+    spread_m !== null &&
+      spread_m > UNEVEN_M &&
       note("warn", "The cloud is uneven here: an edge, or several surfaces. Click the middle of a flat part."),
   ];
 }

@@ -11,7 +11,7 @@ export const LINE_NAMES = ["L1", "L2", "T1"];
 export const SMALLEST_WIDTH_M = 0.05;
 
 /** @param {Band} band @returns {Point} */
-export const middleOf = ({ from_m, to_m }) => times(add(from_m, to_m), 0.5);
+const middleOf = ({ from_m, to_m }) => times(add(from_m, to_m), 0.5);
 
 /** Unit vector to the left of the line. @param {Point} from @param {Point} to @returns {Point} */
 function normal(from, to) {
