@@ -30,7 +30,7 @@ from core.project import Drift, Method, Project, Target, project_json
 from core.results import TargetHistory, read_history_csv
 from core.run import FRAMES_FILE, LoadedInputs, load_inputs, relief_plan
 from core.solution import Solution
-from core.solve import solve, with_histories
+from core.solve import solve, unfiltered_history, with_histories
 from core.storage import File
 from core.version import program_version
 from core.video import frame_index
@@ -278,6 +278,19 @@ class Outcomes:
         if written:
             return Shown(_written(fingerprint(file)), is_earlier=True)
         raise NotYet(f"{target}: not measured by the {chosen} method yet; track first.", path="track")
+
+    def unfiltered(self, folder: ProjectFolder, project: Project, target: str, method: Method) -> Shown:
+        """Return a target's displacement by a method as it was before any filter.
+
+        Raises:
+            NotYet: it was not measured by that method.
+            InputError: the project cannot be solved as it stands.
+        """
+        if by_method(project, method).drift.filter == "none":
+            return self.shown(folder, project, target, method)
+        (wanted,) = (one for one in project.targets if one.name == target)
+        solution = self.solved(folder, project, method).solution
+        return Shown(unfiltered_history(solution, wanted, project.intervals_s))
 
     def gps(self, folder: ProjectFolder, project: Project, drift: Drift) -> GpsCheck | None:
         """Return how a project compares with its GPS, with a filter chosen for the look of it.

@@ -11,14 +11,14 @@ from pydantic import Field
 from app.api.projects import Body
 from app.context import Context, Folder, Here
 from app.errors import Missing
-from app.outcome import Shown, by_method
+from app.outcome import Shown
 from app.store import ProjectFolder
-from core.coordinates import Floats
+from core.coordinates import Floats, finite_rows
 from core.drift import amplitude_spectrum, corner_sweep, filter_warnings, high_pass
 from core.errors import InputError
+from core.intervals import during
 from core.project import Drift, Positive
 from core.results import plain
-from core.solve import unfiltered_history
 
 router = APIRouter(prefix="/api/projects/{project_id}")
 
@@ -62,6 +62,7 @@ def drift(wanted: Filter, folder: Folder, here: Here) -> dict[str, Any]:
         "filtered": _axes(filtered),
         "warnings": warnings,
         "filtered_pre_event_rms_m": at_rest,
+        "geometric_pre_event_rms_m": _rms_at_rest(steady, history.time_s, wanted.interval),
         "is_earlier": shown.is_earlier,
     }
 
@@ -106,13 +107,16 @@ def _steady(here: Context, folder: ProjectFolder, wanted: Filter) -> Floats | No
     project = folder.load().project
     if "geometric" not in here.outcomes.methods(folder, project):
         return None
-    if by_method(project, "geometric").drift.filter == "none":
-        history = here.outcomes.history(folder, project, wanted.target, "geometric")
-    else:
-        target = next(target for target in project.targets if target.name == wanted.target)
-        solution = here.outcomes.solved(folder, project, "geometric").solution
-        history = unfiltered_history(solution, target, project.intervals_s)
+    history = here.outcomes.unfiltered(folder, project, wanted.target, "geometric").history
     return history.p1_m if wanted.point == "p1" else history.p2_m
+
+
+def _rms_at_rest(values: Floats | None, time_s: Floats, interval: tuple[float, float] | None) -> dict[str, Any] | None:
+    """Return by how much a displacement (F, 2) scatters about its mean in an interval; None where it was not seen."""
+    if values is None or len(values) != len(time_s):
+        return None
+    inside = values[during(time_s, interval) & finite_rows(values)]
+    return {"dx": plain(inside[:, 0].std()), "dy": plain(inside[:, 1].std())} if len(inside) else None
 
 
 def _axes(values: Floats) -> dict[str, Any]:

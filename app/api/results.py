@@ -143,12 +143,19 @@ def results(folder: Folder, here: Here) -> dict[str, Any]:
 
 
 @router.get("/results/{target}")
-def history(target: str, folder: Folder, here: Here, method: Method | None = None) -> dict[str, Any]:
+def history(
+    target: str, folder: Folder, here: Here, method: Method | None = None, unfiltered: bool = False
+) -> dict[str, Any]:
     """Return a target's displacement, column by column as in its CSV; null where nothing was measured.
 
-    `is_earlier` tells that the project cannot be solved as it stands: this is what the last run wrote.
+    `is_earlier` tells that the project cannot be solved as it stands: this is what the last run wrote. `unfiltered` asks
+    for what the method measured, whatever filter the project applies to it.
     """
-    shown = here.outcomes.shown(folder, folder.load().project, target, method)
+    project = folder.load().project
+    if unfiltered:
+        shown = here.outcomes.unfiltered(folder, project, target, method or project.method)
+    else:
+        shown = here.outcomes.shown(folder, project, target, method)
     return {**columns_of(shown.history), "is_earlier": shown.is_earlier}
 
 

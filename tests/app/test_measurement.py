@@ -117,6 +117,22 @@ def test_drift_is_looked_at_without_changing_anything(tracked: TestClient) -> No
     assert (nonsense.status_code, nonsense.json()["error"]["kind"]) == (422, "input")
 
 
+def test_what_geometry_measured_stays_to_be_seen_when_the_filter_is_applied(tracked: TestClient) -> None:
+    wanted = {"target": "roof", "corner_hz": 0.8, "interval": [0.0, 0.5]}
+    at_rest = tracked.post(f"{CLIP}/drift", json=wanted).json()["geometric_pre_event_rms_m"]
+    unfiltered = tracked.get(f"{CLIP}/results/roof", params={"unfiltered": True}).json()
+    assert unfiltered == tracked.get(f"{CLIP}/results/roof").json()
+    with changed(tracked, drift={"filter": "high-pass", "corner_hz": 0.8, "order": 4}):
+        filtered = tracked.get(f"{CLIP}/results/roof").json()
+        kept = tracked.get(f"{CLIP}/results/roof", params={"unfiltered": True}).json()
+        assert tracked.post(f"{CLIP}/drift", json=wanted).json()["geometric_pre_event_rms_m"] == pytest.approx(
+            at_rest, abs=1e-7
+        )
+    shift = np.subtract(filtered["p1_dx_m"], unfiltered["p1_dx_m"])
+    assert np.abs(shift).max() > 0.01
+    np.testing.assert_allclose(kept["p1_dx_m"], unfiltered["p1_dx_m"], atol=1e-6)
+
+
 def test_gps_is_laid_over_the_video(tracked: TestClient) -> None:
     answer = tracked.get(f"{CLIP}/validation", params={"target": "roof"}).json()
     assert answer["lag_s"] == pytest.approx(-100.0, abs=0.02)

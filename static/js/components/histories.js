@@ -68,9 +68,9 @@ const STATUS_ORDER = ["ok", "weak", "lost", "excluded"];
 /** @param {string} id @returns {Promise<Results>} */
 export const fetchResults = (id) => get(projectPath(id, "results"));
 
-/** @param {string} id @param {string} target @param {string} [method] @returns {Promise<History>} */
-export function fetchHistory(id, target, method) {
-  return get(projectPath(id, `results/${encodeURIComponent(target)}`, { method }));
+/** @param {string} id @param {string} target @param {string} [method] @param {boolean} [unfiltered]  whatever the project filters @returns {Promise<History>} */
+export function fetchHistory(id, target, method, unfiltered) {
+  return get(projectPath(id, `results/${encodeURIComponent(target)}`, { method, unfiltered }));
 }
 
 /** Per frame the worst status of several targets. @param {string[][]} lists @returns {string[]} */

@@ -24,7 +24,7 @@ import { toastError } from "../components/toast.js";
 /** @typedef {import("../components/interval-fields.js").IntervalName} IntervalName */
 /** @typedef {{dx: (number | null)[], dy: (number | null)[]}} Pair */
 /** @typedef {{dx: number, dy: number}} Rms */
-/** @typedef {{time_s: number[], status: string[], raw: Pair, filtered: Pair, filtered_pre_event_rms_m: Rms | null, warnings: string[], is_earlier: boolean}} DriftAnswer */
+/** @typedef {{time_s: number[], status: string[], raw: Pair, filtered: Pair, filtered_pre_event_rms_m: Rms | null, geometric_pre_event_rms_m: Rms | null, warnings: string[], is_earlier: boolean}} DriftAnswer */
 /** @typedef {{rms_m: Rms, least_m: Rms}} Knee what remains there, and the least that a higher corner leaves */
 /** @typedef {{corners_hz: number[], rms_m: Pair, knee_hz: number | null, knee: Knee | null}} Sweep */
 /** @typedef {{frequency_hz: number[], dx_m: number[], dy_m: number[]}} Spectrum */
@@ -239,7 +239,7 @@ function sideElement() {
       h(
         "p",
         { class: "small soft" },
-        "Written to the result only when applied; the preview on the left is always drawn.",
+        "Curves and sweep show what the filter makes of the uncorrected displacement. Only when applied is it written to the result, where it filters what the project's method measured.",
       ),
       h(
         "div",
@@ -283,7 +283,7 @@ function reload() {
 async function askResults(of) {
   const newest = await fetchResults(page.id);
   const hasCurve = newest.methods.includes("geometric");
-  return { newest, curve: hasCurve ? await fetchHistory(page.id, of, "geometric").catch(() => null) : null };
+  return { newest, curve: hasCurve ? await fetchHistory(page.id, of, "geometric", true).catch(() => null) : null };
 }
 
 /** @param {{newest: Results, curve: History | null}} answered */
@@ -506,11 +506,11 @@ function showFigures() {
     h("div", {}, h("span", { class: "value" }, millimetres(value_m, 1)), h("span", { class: "name" }, name));
   const key = axis === "x" ? "dx" : "dy";
   const after = answer?.filtered_pre_event_rms_m?.[key];
-  const exact = results.stale ? null : results.summary?.targets?.[target]?.pre_event_rms_m?.[axis];
+  const exact = answer?.geometric_pre_event_rms_m?.[key];
   fill(
     figures,
     after == null ? null : figure(after, "filtered, pre-event RMS"),
-    exact == null || store.project.method !== "geometric" ? null : figure(exact, "geometric"),
+    exact == null ? null : figure(exact, "geometric"),
   );
 }
 
