@@ -74,6 +74,15 @@ def check_project(folder: Path, progress: Progress = silent, *, thorough: bool =
         thorough: whether to look at what takes a while too: the point cloud, a minute for a large one, and what the
             reference frame shows in the search bands.
     """
+    return [_in_a_line(problem) for problem in _problems(folder, progress, thorough=thorough)]
+
+
+def _in_a_line(sentence: str) -> str:
+    """Return a sentence in one line, whatever breaks the names of files in it."""
+    return " ".join(sentence.splitlines())
+
+
+def _problems(folder: Path, progress: Progress, *, thorough: bool) -> list[str]:
     file = folder / PROJECT_FILE
     try:
         project = read_project(folder)
@@ -99,7 +108,8 @@ def check_warnings(folder: Path) -> list[str]:
     """
     try:
         video = file_at(folder, read_project(folder).inputs.video)
-        return video_warnings(str(video), probe(video), float(frame_index(video).time_s[-1]))
+        told = video_warnings(str(video), probe(video), float(frame_index(video).time_s[-1]))
+        return [_in_a_line(warning) for warning in told]
     except InputError:
         return []
 

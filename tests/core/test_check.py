@@ -57,6 +57,7 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
     ("change", "told"),
     [
         (put("gone.mp4", "inputs", "video"), "gone.mp4: not found"),
+        (put("go\nne.mp4", "inputs", "video"), "go ne.mp4: not found"),
         (put("gps.csv", "inputs", "video"), "gps.csv: cannot be opened as a video"),
         (put("gone.yaml", "inputs", "lens"), "gone.yaml: not found"),
         (put("gps.csv", "inputs", "lens"), "gps.csv: is not an OpenCV FileStorage file"),
@@ -279,6 +280,19 @@ def test_what_lies_in_the_place_of_results_is_told_as_a_run_tells_it(tmp_path: P
     small_project.write_document(tmp_path, small_project.document())
     (tmp_path / "results").write_text("somebody's notes")
     expected = f"{tmp_path / 'results'}: File exists; move away what lies in its place, then do it again."
+    assert check_project(tmp_path) == [expected]
+    with pytest.raises(OSError, match="File exists") as refusal:
+        run_project(tmp_path)
+    assert disk_problem(refusal.value) == expected
+
+
+def test_results_that_lead_nowhere(tmp_path: Path) -> None:
+    small_project.write_inputs(tmp_path)
+    small_project.write_document(tmp_path, small_project.document())
+    (tmp_path / "results").symlink_to("away/results")
+    expected = (
+        f"{tmp_path / 'results'}: is a link to away/results, which is not there; bring that back or remove the link."
+    )
     assert check_project(tmp_path) == [expected]
     with pytest.raises(OSError, match="File exists") as refusal:
         run_project(tmp_path)
