@@ -176,18 +176,19 @@ def _new(options: argparse.Namespace) -> int:
 
 def _lens(options: argparse.Namespace) -> int:
     from core.lens import write_lens
-    from core.lens_calibration import calibrate
+    from core.lens_calibration import calibrate, require_place_for_lens
 
-    if options.out.is_dir():
-        raise InputError(f"{options.out}: is a folder; name the lens file to write in it.")
+    require_place_for_lens(options.out, options.sources)
     progress = TerminalProgress(sys.stdout)
     with _stoppable(progress) as cancel:
         calibration = calibrate(
             options.sources, board=options.board, square_m=options.square_m, progress=progress, cancel=cancel
         )
     progress.close()
-    print(calibration.report())
     write_lens(options.out, calibration.lens)
+    # Not every terminal knows all the letters of the report.
+    encoding = sys.stdout.encoding or "utf-8"
+    print(calibration.report().encode(encoding, "replace").decode(encoding))
     print(f"Lens: {options.out}")
     return 0
 

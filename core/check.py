@@ -25,6 +25,7 @@ from core.ground_plane import fit_ground_plane
 from core.intervals import within
 from core.lens import Lens, read_lens, require_image_size
 from core.measure import make_measurer
+from core.orthoimage import size_obstacle
 from core.prediction import MeasureSetup
 from core.progress import Progress, silent
 from core.project import (
@@ -35,11 +36,11 @@ from core.project import (
     Lines,
     Project,
     Target,
+    file_problems,
     naming_file,
-    project_problems,
     read_project,
 )
-from core.roof_level import height_obstacle, scale_obstacle
+from core.roof_level import distance_obstacle, height_obstacle, scale_obstacle
 from core.storage import File, file_at
 from core.text_files import decoded
 from core.video import FrameIndex, VideoInfo, frame_index, probe, video_warnings
@@ -48,6 +49,9 @@ from core.video import FrameIndex, VideoInfo, frame_index, probe, video_warnings
 MIN_CROSSING_RAD = np.radians(20.0)
 # L1 and L2 closer than a strip is wide are one line clicked twice.
 MIN_P1_P2_M = 0.05
+# What is narrower holds no pixel, or no two edges.
+MIN_BREADTH_PX = 0.25
+MIN_BAND_PX = 2.0
 
 Result = TypeVar("Result")
 
@@ -70,6 +74,15 @@ def check_project(folder: Path, progress: Progress = silent, *, thorough: bool =
         thorough: whether to look at what takes a while too: the point cloud, a minute for a large one, and what the
             reference frame shows in the search bands.
     """
+    return [_in_a_line(problem) for problem in _problems(folder, progress, thorough=thorough)]
+
+
+def _in_a_line(sentence: str) -> str:
+    """Return a sentence in one line, whatever breaks the names of files in it."""
+    return " ".join(sentence.splitlines())
+
+
+def _problems(folder: Path, progress: Progress, *, thorough: bool) -> list[str]:
     file = folder / PROJECT_FILE
     try:
         project = read_project(folder)
@@ -79,8 +92,8 @@ def check_project(folder: Path, progress: Progress = silent, *, thorough: bool =
     if no_place := results_obstacle(folder):
         problems.append(no_place)
     inputs = _read_inputs(folder, project, problems, progress, thorough=thorough)
-    problems += [f"{file}: {problem}." for problem in obstacles(project, inputs.index, inputs.reference)]
-    for check in (_video_problems, _correspondence_problems, _region_problems, _target_problems, _time_problems):
+    problems += [f"{file}: {problem}." for problem in obstacles(project, inputs.info, inputs.index, inputs.reference)]
+    for check in (_video_problems, _correspondence_problems, _target_problems, _time_problems):
         problems += [f"{file}: {problem}." for problem in check(project, inputs)]
     if thorough and not problems and inputs.reference is not None:
         setup = MeasureSetup.of(project, file_at(folder, project.inputs.video), inputs.reference)
@@ -95,7 +108,8 @@ def check_warnings(folder: Path) -> list[str]:
     """
     try:
         video = file_at(folder, read_project(folder).inputs.video)
-        return video_warnings(str(video), probe(video), float(frame_index(video).time_s[-1]))
+        told = video_warnings(str(video), probe(video), float(frame_index(video).time_s[-1]))
+        return [_in_a_line(warning) for warning in told]
     except InputError:
         return []
 
@@ -111,15 +125,18 @@ def results_obstacle(folder: Path) -> str | None:
     return None if code is None else disk_problem(OSError(code, os.strerror(code), str(results)))
 
 
-def obstacles(project: Project, index: FrameIndex | None, reference: ReferenceFit | None) -> Iterator[str]:
+def obstacles(
+    project: Project, info: VideoInfo | None, index: FrameIndex | None, reference: ReferenceFit | None
+) -> Iterator[str]:
     """Say what makes it useless to begin measuring, each with its place in the file and what to do.
 
     Args:
-        index: of the video, where it can be read.
+        info, index: of the video, where it can be read.
         reference: the fit of the clicks, where there is one.
     """
-    if not project.moving_regions_px:
-        yield "moving_regions_px: none, so the building would count as ground; outline all that moves"
+    if project.inputs.cloud is not None and (absurd := size_obstacle(project.orthoimage)) is not None:
+        yield absurd
+    yield from _region_obstacles(project, info)
     if not project.targets:
         yield "targets: none; add a roof with its search bands L1, L2 and T1"
     if project.method == "geometric" and project.inputs.lens is None:
@@ -132,10 +149,14 @@ def obstacles(project: Project, index: FrameIndex | None, reference: ReferenceFi
             obstacle = height_obstacle(target, camera)
         else:
             obstacle = scale_obstacle(target, camera, has_lens=project.inputs.lens is not None)
+        if target.lines is not None and target.kind == "lines":
+            crossed_badly = list(_line_obstacles(target.lines, f"targets[{number}]"))
+            yield from crossed_badly
+            yield from _width_obstacles(target.lines, f"targets[{number}]", reference)
+            if obstacle is None and not crossed_badly:
+                obstacle = distance_obstacle(target, _apart_m(target.lines), camera)
         if obstacle is not None:
             yield f"targets[{number}].{obstacle}"
-        if target.lines is not None and target.kind == "lines":
-            yield from _line_obstacles(target.lines, f"targets[{number}]")
     if index is not None:
         yield from _time_obstacles(project, index)
 
@@ -164,7 +185,7 @@ def _problems_of_file(file: Path) -> list[str]:
         document = json.loads(decoded(file.read_bytes()))
     except (OSError, ValueError, RecursionError):
         return []
-    return [f"{file}: {problem}." for problem in project_problems(document)]
+    return [f"{file}: {problem}." for problem in file_problems(document)]
 
 
 def _read_inputs(folder: Path, project: Project, problems: list[str], progress: Progress, *, thorough: bool) -> _Inputs:
@@ -242,10 +263,20 @@ def _within_cloud(place_m: tuple[float, float], cloud: Cloud) -> bool:
     return bool(np.all(lowest[:2] <= place_m) and np.all(place_m <= highest[:2]))
 
 
-def _region_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
+def _region_obstacles(project: Project, info: VideoInfo | None) -> Iterator[str]:
+    if not project.moving_regions_px:
+        yield "moving_regions_px: none, so the building would count as ground; outline all that moves"
     for number, region in enumerate(project.moving_regions_px):
-        if inputs.info and not _overlaps_frame(np.array(region), inputs.info):
+        corners = np.array(region)
+        if _breadth(corners) < MIN_BREADTH_PX:
+            yield f"moving_regions_px[{number}]: its corners lie in a line, so it holds nothing; outline it again"
+        elif info and not _overlaps_frame(corners, info):
             yield f"moving_regions_px[{number}]: lies wholly outside the frame; outline it again"
+
+
+def _breadth(corners: Floats) -> float:
+    """Return how far corners (N, 2) lie from the line that fits them best, the root mean square."""
+    return float(np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(corners)))
 
 
 def _overlaps_frame(region_px: Floats, info: VideoInfo) -> bool:
@@ -288,6 +319,32 @@ def _line_obstacles(lines: Lines, place: str) -> Iterator[str]:
             crossings.append(crossing)
     if len(crossings) == 2 and np.hypot(*(crossings[0] - crossings[1])) < MIN_P1_P2_M:
         yield f"{place}.lines: L1 and L2 cross T1 in the same place; put them on two different roof lines"
+
+
+def _apart_m(lines: Lines) -> tuple[float, float]:
+    """Return the least and the most that P1 and P2 may lie apart within bands that cross well, plan metres."""
+    first, second = _crossing(lines.L1, lines.T1), _crossing(lines.L2, lines.T1)
+    assert first is not None
+    assert second is not None
+    apart_m, play_m = float(np.hypot(*(first - second))), (lines.L1.width_m + lines.L2.width_m) / 2
+    return max(apart_m - play_m, 0.0), apart_m + play_m
+
+
+def _width_obstacles(lines: Lines, place: str, reference: ReferenceFit | None) -> Iterator[str]:
+    """Say which bands are too narrow to search; nobody would be told that a wider one was searched instead."""
+    if reference is None:
+        return
+    for name in LINE_NAMES:
+        band: Band = getattr(lines, name)
+        start, end = np.array(band.from_m), np.array(band.to_m)
+        aside = np.array([start[1] - end[1], end[0] - start[0]]) / np.hypot(*(end - start)) * band.width_m / 2
+        left, right = reference.raw_from_plan((start + end) / 2 + np.stack([aside, -aside]))
+        width_px = float(np.hypot(*(left - right)))
+        if width_px < MIN_BAND_PX:
+            yield (
+                f"{place}.lines.{name}.width_m: {band.width_m:g} m are {width_px:.2g} pixels of the reference frame, "
+                "too narrow to search; widen the band"
+            )
 
 
 def _crossing(line: Band, across: Band) -> Floats | None:

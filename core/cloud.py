@@ -6,6 +6,7 @@ is relative to `Cloud.origin_m`: coordinates of millions of metres, as in UTM, l
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -197,6 +198,7 @@ def _read_compressed_pcd(path: Path) -> PointTable:
 def _read_las(path: Path, progress: Progress) -> Cloud:
     import laspy
 
+    _require_room_for_records(path)
     try:
         with laspy.open(path) as reader:
             header = reader.header
@@ -224,6 +226,24 @@ def _read_las(path: Path, progress: Progress) -> Cloud:
     world_m = whole["xyz"] * header.scales + header.offsets
     _require_on_earth(path, world_m)
     return make_cloud(world_m, rgb=whole.get("rgb"), intensity=whole["intensity"], notes=notes)
+
+
+def _require_room_for_records(path: Path) -> None:
+    """Refuse a header that promises more records than there is room for: laspy would go on reading for ever.
+
+    Source: LAS 1.4 R15, public header block; its records begin with 54 bytes each, those after the points with 60.
+    """
+    with path.open("rb") as stream:
+        header = stream.read(247).ljust(247, b"\0")
+    size = path.stat().st_size
+    header_bytes, points_at, records = struct.unpack_from("<HII", header, 94)
+    last_at, last_records = struct.unpack_from("<QI", header, 235) if header[25] >= 4 else (0, 0)
+    too_many = header_bytes + 54 * records > min(points_at, size)
+    if header[:4] == b"LASF" and (too_many or (last_records and last_at + 60 * last_records > size)):
+        raise InputError(
+            f"{path}: its header promises {max(records, last_records)} records for which it has no room; copy or "
+            "export it again, it is damaged."
+        )
 
 
 def _require_sound(path: Path, header: Any) -> None:

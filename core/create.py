@@ -28,7 +28,8 @@ def create_project(
         name: what people call it; the folder's name where None.
 
     Raises:
-        InputError: there is a project already, an input is missing, or the lens is another camera's.
+        InputError: there is a project already, an input is missing, its name is no text, or the lens is another
+            camera's.
     """
     file = folder / PROJECT_FILE
     if file.exists():
@@ -38,9 +39,8 @@ def create_project(
     for path in (video, cloud, lens, gps):
         if isinstance(path, Path) and not path.is_file():
             raise InputError(f"{path}: there is no such file; correct the path.")
-    _require_lens_of_video(lens, video)
     project = Project(
-        name=name or folder.resolve().name,
+        name=_as_text(name or folder.resolve().name),
         inputs=Inputs(
             video=_seen_from(folder, video),
             cloud=_seen_from(folder, cloud) if cloud else None,
@@ -48,6 +48,7 @@ def create_project(
             gps=GpsInput(file=_seen_from(folder, gps)) if gps else None,
         ),
     )
+    _require_lens_of_video(lens, video)
     write_project(folder, project)
     return project
 
@@ -59,10 +60,29 @@ def _require_lens_of_video(lens: Path | None, video: File) -> None:
 
 
 def _seen_from(folder: Path, path: File) -> str:
-    """Return the path relative to the folder with forward slashes; absolute where they share no drive."""
+    """Return the path relative to the folder with forward slashes; absolute where they share no drive.
+
+    Raises:
+        InputError: a name in it is no text.
+    """
     if isinstance(path, FarFile):
         return path.address
     try:
-        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+        seen = Path(os.path.relpath(path.resolve(), folder.resolve()))
     except ValueError:
-        return path.resolve().as_posix()
+        seen = path.resolve()
+    return _as_text(seen.as_posix())
+
+
+def _as_text(name: str) -> str:
+    """Return a name that can be written into a file of text.
+
+    Raises:
+        InputError: the system knows it by bytes that are no UTF-8, as old archives unpack.
+    """
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        shown = os.fsencode(name).decode(errors="replace")
+        raise InputError(f"{shown}: has letters in its name that are not UTF-8; rename it.") from None
+    return name

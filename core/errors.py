@@ -28,6 +28,8 @@ def disk_problem(error: OSError) -> str:
         # A file far up may stand in the way of a whole path.
         file = next((parent for parent in Path(file).parents if parent.is_file()), file)
     where = f"{os.fsdecode(file)}: " if isinstance(file, str | bytes | os.PathLike) else ""
+    if error.errno == errno.EEXIST and isinstance(file, str | os.PathLike) and _leads_nowhere(Path(file)):
+        return f"{where}is a link to {os.readlink(file)}, which is not there; bring that back or remove the link."
     if error.errno in DISK_FULL:
         remedy = "make room on the disk"
     elif error.errno in OBSTRUCTED:
@@ -35,3 +37,7 @@ def disk_problem(error: OSError) -> str:
     else:
         remedy = "make it accessible"
     return f"{where}{error.strerror or error}; {remedy}, then do it again."
+
+
+def _leads_nowhere(file: Path) -> bool:
+    return file.is_symlink() and not file.exists()

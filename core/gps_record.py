@@ -26,7 +26,7 @@ class GpsRecord:
     """Positions of an antenna on the target.
 
     Attributes:
-        name: of the file, for messages.
+        name: of the file with its folder, for messages.
         time_s: (G,) increasing, the receiver's own clock.
         position_m: (G, 2) east and north, any origin.
     """
@@ -112,7 +112,7 @@ def read_gps(path: Path, settings: GpsInput) -> GpsRecord:
             f"line before ({time_s[before]:.12g}); sort the record and remove what is double."
         )
     _require_one_stretch(lines, time_s)
-    return GpsRecord(path.name, read_only(time_s), read_only(positions))
+    return GpsRecord(str(path), read_only(time_s), read_only(positions))
 
 
 def _require_one_notation(lines: _Lines, name: str, moments: Sequence[ClockTime]) -> None:

@@ -316,6 +316,8 @@ class _LensNodes:
         node = self._node(name)
         if node is None:
             raise self._refuse(name, "is missing; add it, or calibrate anew with `rooftrack lens`")
+        if _would_be_cut_off(node):
+            raise self._refuse(name, f"has dt: {node.getNode('dt').string()}, which cuts off its decimals; write dt: d")
         try:
             values = _numbers(node)
         except (cv2.error, SystemError, TypeError, ValueError):
@@ -414,6 +416,14 @@ def _numbers(node: Any) -> Floats:
         return _numbers(node.getNode("data"))
     matrix = node.mat()
     return np.empty(0) if matrix is None else np.asarray(matrix, dtype=np.float64)
+
+
+def _would_be_cut_off(node: Any) -> bool:
+    """Whether a matrix says that its numbers are whole, by `dt` other than `f` or `d`, but they are not."""
+    if not node.isMap() or node.getNode("dt").string()[-1:] in ("", "f", "d"):
+        return False
+    data = node.getNode("data")
+    return data.isSeq() and any(not data.at(place).real().is_integer() for place in range(data.size()))
 
 
 def _shape(array: Floats) -> str:

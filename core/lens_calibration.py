@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from core.coordinates import Floats, read_only
 from core.errors import InputError
-from core.lens import Lens, LensSigma
+from core.lens import Lens, LensSigma, read_lens
 from core.progress import CancelToken, Progress, silent
 from core.video import frame_index, read_frames
 
@@ -25,6 +25,8 @@ Luma = NDArray[np.uint8]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 MIN_VIEWS = 4
+# Bytes; a lens takes a thousand.
+_LARGEST_LENS_FILE = 1 << 20
 # Frames of a video are looked at this many times at most, in equal parts of its duration.
 _VIDEO_PARTS = 40
 _FRAMES_PER_PART = 5
@@ -222,6 +224,27 @@ def _pictures_in(folder: Path) -> list[Path]:
     if not pictures:
         raise InputError(f"{folder}: is a folder without pictures; give checkerboard pictures, or a video.")
     return pictures
+
+
+def require_place_for_lens(file: Path, sources: Sequence[Path]) -> None:
+    """Refuse to write a lens in the place of anything but an earlier lens, pictures of the board above all.
+
+    Raises:
+        InputError: something else is there.
+    """
+    if file.is_dir():
+        raise InputError(f"{file}: is a folder; name the lens file to write in it.")
+    if not file.exists() or not file.stat().st_size:
+        return
+    if any(source.exists() and source.samefile(file) for source in sources):
+        raise InputError(f"{file}: is one of the pictures to calibrate from; give --out the name of a lens file.")
+    try:
+        if file.stat().st_size < _LARGEST_LENS_FILE:
+            read_lens(file)
+            return
+    except InputError:
+        pass
+    raise InputError(f"{file}: exists and is no lens file; give --out another name, or move it away.")
 
 
 def _read_image(path: Path) -> Luma:

@@ -19,6 +19,7 @@ from core.errors import InputError
 from core.ground_plane import RELIEF_REACH_M, GroundPlane
 from core.lens import Lens
 from core.progress import Progress, silent
+from core.project import PROJECT_FILE
 from core.project import Orthoimage as Settings
 from core.storage import write_atomically
 
@@ -27,6 +28,9 @@ Float32 = NDArray[np.float32]
 
 ORTHOIMAGE_FILE = "orthoimage.tif"
 MAX_PIXELS = 60_000_000
+_LEAST_PIXELS = 16
+# Finer than any scanner's beam, and coarser than what is clicked: both are another unit.
+_PIXEL_SIZES_M = (0.001, 1.0)
 # Larger gaps are shadows of the scanner, not spaces between neighbouring points.
 MAX_FILL_M = 0.25
 # A gap is filled up to this many times the spacing of the points around it.
@@ -100,7 +104,7 @@ def make_orthoimage(cloud: Cloud, plane: GroundPlane, settings: Settings, progre
         spacings.append(spacing[inner][measured[inner]][::97])
         progress("orthoimage", last, grid.height)
     if not measured_count:
-        raise InputError("the orthoimage holds no points of the cloud; correct orthoimage.extent_m.")
+        raise InputError(f"{PROJECT_FILE}: orthoimage.extent_m: holds no points of the cloud; correct it.")
     rgb[~filled] = 0
     return Orthoimage(
         grid=grid,
@@ -116,24 +120,50 @@ def make_orthoimage(cloud: Cloud, plane: GroundPlane, settings: Settings, progre
 
 def _grid(cloud: Cloud, plane: GroundPlane, settings: Settings) -> tuple[OrthoGrid, tuple[str, ...]]:
     pixel = settings.pixel_size_m
-    if settings.extent_m is not None:
-        west, south, east, north = settings.extent_m
-        notes: tuple[str, ...] = ()
-    else:
-        (west, south, east, north), notes = _extent_of_ground(cloud, plane, pixel)
-    columns, rows = int(np.ceil((east - west) / pixel - 1e-6)), int(np.ceil((north - south) / pixel - 1e-6))
+    _refuse_if(size_obstacle(settings))
+    extent, notes = (settings.extent_m, ()) if settings.extent_m else _extent_of_ground(cloud, plane, pixel)
+    columns, rows = _pixels_of(extent, pixel)
+    _refuse_if(_number_obstacle(columns, rows, pixel))
+    return OrthoGrid(extent[0], extent[3], pixel, columns, rows), notes
+
+
+def size_obstacle(settings: Settings) -> str | None:
+    """Return what makes a raster absurd whatever the cloud, from its key in `project.json` on; None where nothing does.
+
+    It has no end, as an obstacle of `core.roof_level`.
+    """
+    pixel, (least, most) = settings.pixel_size_m, _PIXEL_SIZES_M
+    if not least <= pixel <= most:
+        return (
+            f"orthoimage.pixel_size_m: {pixel:g} is no size of a pixel in metres; choose one of {least:g} to {most:g}"
+        )
+    return None if settings.extent_m is None else _number_obstacle(*_pixels_of(settings.extent_m, pixel), pixel)
+
+
+def _pixels_of(extent_m: tuple[float, float, float, float], pixel: float) -> tuple[int, int]:
+    """Return how many columns and rows of pixels a raster has."""
+    west, south, east, north = extent_m
+    return int(np.ceil((east - west) / pixel - 1e-6)), int(np.ceil((north - south) / pixel - 1e-6))
+
+
+def _number_obstacle(columns: int, rows: int, pixel: float) -> str | None:
     if columns * rows > MAX_PIXELS:
         enough = pixel * np.sqrt(columns * rows / MAX_PIXELS)
-        raise InputError(
-            f"an orthoimage of {columns} x {rows} pixels is too large (limit {MAX_PIXELS // 1_000_000} million); "
-            f"set orthoimage.pixel_size_m to {np.ceil(enough * 1000) / 1000:g} or more, or a smaller extent_m."
+        return (
+            f"orthoimage: {columns} x {rows} pixels are too many (limit {MAX_PIXELS // 1_000_000} million); "
+            f"set pixel_size_m to {np.ceil(enough * 1000) / 1000:g} or more, or a smaller extent_m"
         )
-    if columns < 16 or rows < 16:
-        raise InputError(
-            f"an orthoimage of {columns} x {rows} pixels is too small; "
-            "set a smaller orthoimage.pixel_size_m or a larger extent_m."
+    if min(columns, rows) < _LEAST_PIXELS:
+        return (
+            f"orthoimage: {columns} x {rows} pixels are too few (least {_LEAST_PIXELS} each way); set a smaller "
+            "pixel_size_m or a larger extent_m"
         )
-    return OrthoGrid(west, north, pixel, columns, rows), notes
+    return None
+
+
+def _refuse_if(obstacle: str | None) -> None:
+    if obstacle is not None:
+        raise InputError(f"{PROJECT_FILE}: {obstacle}.")
 
 
 def _extent_of_ground(
@@ -147,7 +177,9 @@ def _extent_of_ground(
     metres = np.stack([east, numbers - east * _FAR_M], axis=1)
     metres = metres[counts >= max(2.0, _STRAY_SHARE * float(np.median(counts)))]
     if not len(metres):
-        raise InputError("the ground of the point cloud is too thin for an orthoimage; set orthoimage.extent_m.")
+        raise InputError(
+            f"{PROJECT_FILE}: orthoimage.extent_m: null, but the ground of the cloud is too thin to tell it; set it."
+        )
     low, high = np.percentile(metres, 1, axis=0), np.percentile(metres, 99, axis=0) + 1
     notes: tuple[str, ...] = ()
     if np.prod((high - low) / pixel) > MAX_PIXELS:

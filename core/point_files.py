@@ -20,7 +20,7 @@ from core.errors import InputError
 from core.progress import Progress
 from core.text_files import UTF_16_MARKS
 
-_TEXT_CHUNK_ROWS = 500_000
+_TEXT_CHUNK_LINES = 500_000
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf".decode("latin-1")
 
 # What surveyors, scanners and programs call the same column.
@@ -29,9 +29,9 @@ _COLUMN_NAMES = {
     "y": ("y", "north", "northing", "north_m", "y_m"),
     "z": ("z", "height", "elevation", "elev", "up", "up_m", "z_m", "altitude"),
     "intensity": ("intensity", "scalar_intensity", "i", "reflectance", "scalar_reflectance"),
-    "red": ("red", "r", "diffuse_red"),
-    "green": ("green", "g", "diffuse_green"),
-    "blue": ("blue", "b", "diffuse_blue"),
+    "red": ("red", "r", "rf", "diffuse_red"),
+    "green": ("green", "g", "gf", "diffuse_green"),
+    "blue": ("blue", "b", "bf", "diffuse_blue"),
 }
 _COLUMN_OF_NAME = {name: column for column, names in _COLUMN_NAMES.items() for name in names}
 
@@ -41,6 +41,7 @@ _PLY_TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _UNIT = re.compile(rb"[\[(][^\])]*[\])]")
+_WHOLE = re.compile(r"[-+]?\d+")
 _WITH_COMMAS = re.compile(rb"[-+]?\d+(?P<decimals>,\d+)?(?P<after>,?)")
 
 
@@ -79,7 +80,7 @@ def read_ply(path: Path, progress: Progress) -> PointTable:
         if encoding == "ascii":
             for _ in range(sum(lines for _, lines, _ in before)):
                 stream.readline()
-            values = _text_rows(path, stream, _header_lines(path), columns=len(properties), rows=count)
+            values = _text_rows(path, _text_lines(stream, count), _header_lines(path), columns=len(properties))
             _require_count(path, len(values), count)
             table: Any = {name: values[:, column] for column, (name, _) in enumerate(properties)}
         else:
@@ -155,7 +156,7 @@ def read_pcd(path: Path, progress: Progress) -> PointTable | None:
         names = [name if width == 1 else f"{name}*{width}" for name, _, width in fields]
         if encoding == "ascii":
             firsts = np.cumsum([0, *counts[:-1]])
-            values = _text_rows(path, stream, lines, columns=sum(counts), rows=count)
+            values = _text_rows(path, _text_lines(stream, count), lines, columns=sum(counts))
             _require_count(path, len(values), count)
             table: Any = {name: values[:, first] for name, first in zip(names, firsts, strict=True)}
         elif encoding in ("binary", "binary_compressed"):
@@ -210,16 +211,11 @@ def read_text(path: Path, progress: Progress) -> PointTable:
         for _ in range(layout.skip):
             stream.readline()
         lines_before = layout.skip
-        while True:
-            part = _text_rows(
-                path, stream, lines_before, columns=len(layout.names), rows=_TEXT_CHUNK_ROWS, comma=layout.comma
-            )
-            if not len(part):
-                break
-            parts.append(part)
-            lines_before += len(part)
+        while lines := _text_lines(stream, _TEXT_CHUNK_LINES, layout.comma):
+            parts.append(_text_rows(path, lines, lines_before, columns=len(layout.names)))
+            lines_before += len(lines)
             progress("cloud", int(1000 * stream.tell() / size), 1000)
-    if not parts:
+    if not any(map(len, parts)):
         raise InputError(f"{path}: holds no points; export it again.")
     values = np.concatenate(parts) if len(parts) > 1 else parts[0]
     if layout.count is not None and len(values) != layout.count:
@@ -265,7 +261,7 @@ def _text_layout(path: Path) -> _TextLayout:
                         f"{path}: line 1 has a word for each column but does not name x, y and z; name them so, or "
                         "put # before a line that is only a title."
                     )
-                return _TextLayout(number, names or _names_by_number(path, stream, words, comma), count, comma)
+                return _TextLayout(number, names or _names_by_number(path, stream, line, comma), count, comma)
             else:
                 raise InputError(
                     f"{path}: line {number + 1} is neither names of columns with x, y and z nor three or more numbers; "
@@ -310,7 +306,9 @@ def _all_numbers(words: list[str]) -> bool:
     return True
 
 
-def _names_by_number(path: Path, stream: IO[bytes], first: list[str], comma: str) -> list[str]:
+def _names_by_number(path: Path, stream: IO[bytes], first_line: bytes, comma: str) -> list[str]:
+    """Return what columns without names are, by their number and by what the first lines hold."""
+    first = _words(first_line, comma)
     by_count = {
         3: [],
         4: ["intensity"],
@@ -320,19 +318,36 @@ def _names_by_number(path: Path, stream: IO[bytes], first: list[str], comma: str
     if len(first) not in by_count:
         raise InputError(f"{path}: has {len(first)} columns without names; add a first line that names x, y and z.")
     names = ["x", "y", "z", *by_count[len(first)]]
-    sample = [first, *(_words(line, comma) for line, _ in zip(stream, range(200), strict=False))]
-    colours = [[float(word) for word in row[-3:]] for row in sample if len(row) == len(first) and _all_numbers(row)]
-    if "red" in names and any(value < 0 or value != int(value) for row in colours for value in row):
-        # Three more columns with signs or fractions are normals, not colours.
+    lines = [first_line, *(line for line, _ in zip(stream, range(200), strict=False))]
+    rows = [row for row in (_words(line, comma) for line in lines) if len(row) == len(first) and _all_numbers(row)]
+    if len(first) >= 6 and b"," in first_line and all(_WHOLE.fullmatch(word) for row in rows for word in row):
+        raise InputError(
+            f"{path}: its {len(first)} columns of whole numbers may be half as many with decimal commas; export the "
+            "points with decimal points, or add a first line that names x, y and z."
+        )
+    if "red" in names and not _are_colours(np.array([row[-3:] for row in rows], dtype=np.float64)):
         names[-3:] = ["normal_x", "normal_y", "normal_z"]
     return names
 
 
-def _text_rows(
-    path: Path, stream: IO[bytes], lines_before: int, *, columns: int, rows: int, comma: str = " "
-) -> Floats:
-    """Read up to `rows` lines of `columns` numbers, however they are separated."""
-    lines = [_spaced(line, comma) for line in itertools.islice(stream, rows)]
+def _are_colours(values: Floats) -> bool:
+    """Whether three more columns (N, 3) are colours, whole numbers or parts of one, and not normals of length one."""
+    are_normals = np.allclose(np.linalg.norm(values, axis=1), 1.0, atol=0.01)
+    are_whole, are_parts = np.all(values == np.rint(values)), np.all(values <= 1)
+    return bool(not are_normals and np.all(values >= 0) and (are_whole or are_parts))
+
+
+def _text_lines(stream: IO[bytes], most: int, comma: str = " ") -> list[str]:
+    """Return the next lines, up to so many, with blanks between their columns; none at the end of the file."""
+    return [_spaced(line, comma) for line in itertools.islice(stream, most)]
+
+
+def _text_rows(path: Path, lines: list[str], lines_before: int, *, columns: int) -> Floats:
+    """Return (N, columns) what lines hold besides comments and blanks.
+
+    Raises:
+        InputError: a line holds something else; it is named.
+    """
     if not any(line.strip() and not line.startswith(("#", "//")) for line in lines):
         return np.empty((0, columns))
     try:

@@ -16,17 +16,24 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from core.coordinates import LARGEST_M
 from core.errors import InputError
 from core.storage import write_atomically
 from core.text_files import decoded
 
 PROJECT_FILE = "project.json"
 RESULTS_FOLDER = "results"
+# No frame is larger; nor is what lies beside one of any use so far from it.
+LARGEST_PX = 1e6
 # Strict: neither "18.3" nor true is a number.
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 Whole = Annotated[int, Field(strict=True)]
-Point = tuple[Finite, Finite]
+Metres = Annotated[Finite, Field(ge=-LARGEST_M, le=LARGEST_M)]
+Length = Annotated[Positive, Field(le=LARGEST_M)]
+Pixels = Annotated[Finite, Field(ge=-LARGEST_PX, le=LARGEST_PX)]
+Point = tuple[Metres, Metres]
+PointPx = tuple[Pixels, Pixels]
 Interval = tuple[Finite, Finite]
 Method = Literal["geometric", "paper"]
 
@@ -78,9 +85,9 @@ class Inputs(Model):
 class Orthoimage(Model):
     """Raster of the orthoimage and the height of the ground in the cloud."""
 
-    pixel_size_m: Positive = 0.01
-    extent_m: tuple[Finite, Finite, Finite, Finite] | None = Field(default=None, description="west, south, east, north")
-    ground_z_m: Finite | None = None
+    pixel_size_m: Length = 0.01
+    extent_m: tuple[Metres, Metres, Metres, Metres] | None = Field(default=None, description="west, south, east, north")
+    ground_z_m: Metres | None = None
 
     @field_validator("extent_m")
     @classmethod
@@ -95,8 +102,8 @@ class Correspondence(Model):
 
     id: Whole
     ground_m: Point
-    frame_px: Point
-    enabled: bool = True
+    frame_px: PointPx
+    enabled: Annotated[bool, Field(strict=True)] = True
 
 
 class Band(Model):
@@ -104,7 +111,7 @@ class Band(Model):
 
     from_m: Point
     to_m: Point
-    width_m: Positive = 0.5
+    width_m: Length = 0.5
 
     @model_validator(mode="after")
     def _has_length(self) -> Band:
@@ -126,8 +133,8 @@ class Target(Model):
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")
     kind: Literal["lines", "points"] = "lines"
-    height_m: Finite | None = None
-    p1_p2_m: Positive | None = None
+    height_m: Metres | None = None
+    p1_p2_m: Length | None = None
     lines: Lines | None = None
     region_m: tuple[Point, ...] | None = None
     relative_to: str | None = None
@@ -173,12 +180,19 @@ class Project(Model):
     orthoimage: Orthoimage = Orthoimage()
     reference_frame: Annotated[Whole, Field(ge=0)] = 0
     correspondences: tuple[Correspondence, ...] = ()
-    moving_regions_px: tuple[tuple[Point, ...], ...] = ()
+    moving_regions_px: tuple[tuple[PointPx, ...], ...] = ()
     targets: tuple[Target, ...] = ()
     excluded_frames: tuple[tuple[Whole, Whole], ...] = ()
     intervals_s: Intervals = Intervals()
     method: Method = "geometric"
     drift: Drift = Drift()
+
+    @field_validator("rooftrack", mode="before")
+    @classmethod
+    def _is_number(cls, version: object) -> object:
+        if isinstance(version, bool | float):
+            raise ValueError("must be the whole number 1")
+        return version
 
     @field_validator("correspondences")
     @classmethod
@@ -188,7 +202,7 @@ class Project(Model):
 
     @field_validator("moving_regions_px")
     @classmethod
-    def _are_polygons(cls, regions: tuple[tuple[Point, ...], ...]) -> tuple[tuple[Point, ...], ...]:
+    def _are_polygons(cls, regions: tuple[tuple[PointPx, ...], ...]) -> tuple[tuple[PointPx, ...], ...]:
         for number, region in enumerate(regions):
             if len(region) < 3:
                 raise ValueError(f"region {number} has {len(region)} corners; a polygon needs three or more")
@@ -273,7 +287,7 @@ def parse_project(text: str, file: Path | str = PROJECT_FILE) -> Project:
         raise InputError(f"{file}: {place} is not valid JSON ({error.msg}); correct it there.") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file}: no project looks like this ({error}); restore it from a copy.") from None
-    problems = project_problems(document)
+    problems = file_problems(document)
     if problems:
         raise InputError(f"{file}: " + "; ".join(problems) + ".")
     return Project.model_validate(document)
@@ -298,6 +312,12 @@ def _without_repetition(pairs: list[tuple[str, Any]], file: Path | str) -> dict[
         twice = next(key for key in keys if keys.count(key) > 1)
         raise InputError(f'{file}: the key "{twice}" stands twice in one place; remove one of them.')
     return document
+
+
+def file_problems(document: Any) -> list[str]:
+    """Return each problem of a whole file: those of the project it describes, and that it does not say what it is."""
+    unnamed = isinstance(document, dict) and "rooftrack" not in document
+    return [*(['rooftrack: missing, add it: "rooftrack": 1'] if unnamed else []), *project_problems(document)]
 
 
 def project_problems(document: Any) -> list[str]:

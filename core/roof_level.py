@@ -17,6 +17,10 @@ from core.project import PROJECT_FILE, Target
 
 # How far scales at the roof may lie from each other: wrong by more are height, lens or bands, not the measurement.
 SCALE_TOLERANCE = 0.02
+# How many times as long, or as short, as the bands allow a known distance is before it must be another unit.
+_OTHER_UNIT = 2.0
+# Nothing rises nearer to the camera than to this part of its height.
+_LEAST_SCALE = 0.1
 
 
 def height_obstacle(target: Target, camera: Pose | None) -> str | None:
@@ -78,6 +82,28 @@ def distance_doubt(target: Target, places_m: Floats, *, height_m: float | None) 
     return (
         f"P1 and P2 of {target.name} lie {distance_m:.3f} m apart where it is {height_m:.2f} m high, but p1_p2_m is "
         f"{target.p1_p2_m:.3f} m; check height_m, the lens and the bands."
+    )
+
+
+def distance_obstacle(target: Target, apart_m: tuple[float, float], camera: Pose | None) -> str | None:
+    """Return what makes a target's known distance P1–P2 impossible, most likely another unit, or None.
+
+    Args:
+        apart_m: the least and the most that its bands let P1 and P2 lie apart where they appear, plan metres.
+        camera: as in `height_obstacle`, which has nothing against the target.
+    """
+    if target.p1_p2_m is None:
+        return None
+    if camera is not None and target.height_m is not None:
+        lowest = highest = 1.0 - target.height_m / camera.centre_m[2]
+    else:
+        lowest, highest = _LEAST_SCALE, 1.0
+    least_m, most_m = lowest * apart_m[0], highest * apart_m[1]
+    if least_m / _OTHER_UNIT <= target.p1_p2_m <= most_m * _OTHER_UNIT:
+        return None
+    return (
+        f"p1_p2_m: {target.p1_p2_m:g}, but its bands put P1 and P2 {least_m:.2f} to {most_m:.2f} m apart; write it in "
+        "metres, or correct the bands"
     )
 
 

@@ -304,7 +304,7 @@ def _middle_of_targets(project: Project, otherwise: Floats) -> Floats:
 
 
 def _require_runnable(inputs: LoadedInputs) -> None:
-    for obstacle in obstacles(inputs.project, frame_index(inputs.video), inputs.reference_fit):
+    for obstacle in obstacles(inputs.project, inputs.info, frame_index(inputs.video), inputs.reference_fit):
         raise InputError(f"{inputs.folder / PROJECT_FILE}: {obstacle}.")
 
 

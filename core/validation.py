@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,8 @@ _OTHER_UNITS = (
     ("feet", 1 / 0.3048, 1.25),
     ("degrees", 1 / 111_000, 5.0),
 )
+# No receiver on a shaken roof takes samples as seldom as this; in milliseconds they seem to lie farther apart.
+_SELDOM_S = 5.0
 # GPS samples farther apart than this many frames straddle peaks that the video sees.
 _COARSE_FRAMES = 1.5
 
@@ -211,7 +214,7 @@ def compare_with_gps(
         raise InputError(
             f"{gps.name}: its times, {gps.time_s[0]:g} to {gps.time_s[-1]:g} s, share nothing with the measured video, "
             f"{video.times[0]:g} to {video.times[-1]:g} s, and no common motion tells the clocks' difference; "
-            "give the record of this video, or set inputs.gps to null."
+            f"{_unit_of_time(gps)}give the record of this video, or set inputs.gps to null."
         )
     baseline_m, without_rest = _baseline(sample_s, sample_m, video_m, intervals)
     sample_m = sample_m - baseline_m
@@ -220,7 +223,7 @@ def compare_with_gps(
         lag_s=lag_s,
         lag_sigma_s=lag.sigma_s,
         correlation=lag.correlation,
-        message=" ".join(sentence for sentence in (lag.doubt(gps.name), without_rest) if sentence),
+        message=" ".join(sentence for sentence in (lag.doubt(gps), without_rest) if sentence),
         time_s=read_only(sample_s),
         gps_m=read_only(sample_m),
         video_m=read_only(video_m),
@@ -279,13 +282,14 @@ class _Lag:
     correlation: float
     rival_s: float | None = None
 
-    def doubt(self, name: str) -> str:
+    def doubt(self, gps: GpsRecord) -> str:
         """Say in a sentence what is uncertain; empty where nothing is."""
+        name = Path(gps.name).name
         if self.sigma_s is None:
             return (
                 f"The clock lag of {name} could not be told, because video and GPS show no motion in common "
-                f"over {_LEAST_SHARED} samples or more (correlation {self.correlation:.2f}); the records are compared "
-                "as if their clocks agreed."
+                f"over {_LEAST_SHARED} samples or more (correlation {self.correlation:.2f}); {_unit_of_time(gps)}the "
+                "records are compared as if their clocks agreed."
             )
         if self.rival_s is not None:
             return (
@@ -321,6 +325,14 @@ def _lag(video: _Video, gps: GpsRecord, max_lag_s: float | None) -> _Lag:
     (lag_s, sigma_s), *others = sorted(refined, key=lambda result: result[1])
     rivals = [other_s for other_s, other in others if other < _RIVAL * sigma_s and abs(other_s - lag_s) > 2 * step_s]
     return _Lag(lag_s, sigma_s, best, rivals[0] if rivals else None)
+
+
+def _unit_of_time(gps: GpsRecord) -> str:
+    """Say in a part of a sentence that times look like milliseconds; empty where they do not."""
+    apart_s = float(np.median(np.diff(gps.time_s)))
+    if apart_s < _SELDOM_S:
+        return ""
+    return f"its samples lie {apart_s:g} s apart, as if times were in milliseconds: divide them by 1000; "
 
 
 def _correlations(video: _Video, gps: GpsRecord) -> tuple[Floats, Floats]:

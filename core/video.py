@@ -124,8 +124,8 @@ def opened_video(path: File) -> Iterator[tuple[InputContainer, VideoStream]]:
         InputError: as `probe`, but for what only decoding tells.
     """
     with ExitStack() as stack:
-        # FFmpeg opens what lies on this machine itself.
-        source = str(path) if isinstance(path, Path) else stack.enter_context(opened(path))
+        # FFmpeg opens what lies on this machine itself; what a name begins with, up to a colon, is a protocol to it.
+        source = str(path.absolute()) if isinstance(path, Path) else stack.enter_context(opened(path))
         container = stack.enter_context(_container(path, source))
         if _is_picture(container):
             raise InputError(f"{path}: is a picture and no video; choose the file with the film.")
@@ -164,12 +164,13 @@ def probe(path: File) -> VideoInfo:
     """Return what the container and its first frame say, without reading the rest.
 
     Raises:
-        InputError: no such file, no container, no video stream, or no frame that can be decoded.
+        InputError: no such file, no container, no video stream, no frame that can be decoded, or one to be mirrored.
     """
     with opened_video(path) as (container, stream):
         frame = next(decoded_pictures(container, stream), None)
         if frame is None:
             raise InputError(f"{path}: not one frame can be decoded; export the video again as H.264 MP4.")
+        _require_turned_only(path, frame)
         quarter_turned = frame.rotation % 180 != 0
         width, height = (frame.height, frame.width) if quarter_turned else (frame.width, frame.height)
         duration_s = _duration_s(container, stream)
@@ -184,6 +185,24 @@ def probe(path: File) -> VideoInfo:
             rotation_deg=-frame.rotation % 360,
             # Of what the stream says besides, not every codec fills in the order of fields.
             is_interlaced=frame.interlaced_frame,
+        )
+
+
+def _require_turned_only(path: File, frame: VideoFrame) -> None:
+    """Refuse a video that is to be shown in another way than as filmed or in quarter turns of it.
+
+    Source: FFmpeg, libavutil/display.h: the matrix's first two rows hold two numbers each and one for perspective.
+    """
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return
+    a, b, _, c, d = np.frombuffer(memoryview(matrix), dtype=np.int32)[:5].astype(np.float64)
+    mirrored = a * d - b * c < 0
+    if mirrored or frame.rotation % 90:
+        how = "mirrored" if mirrored else f"turned by {abs(frame.rotation)} degrees"
+        raise InputError(
+            f"{path}: says that it is to be shown {how}, which frames are not measured in; export it again the way the "
+            "camera saw it."
         )
 
 

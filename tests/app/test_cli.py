@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +18,7 @@ import pytest
 
 from app.cli import main
 from core.errors import InputError
+from core.lens import Lens, read_lens
 from core.project import read_project
 from tests import small_project
 
@@ -232,6 +235,50 @@ def test_a_lens_is_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert f"{tmp_path}: is a folder" in one_sentence(capsys.readouterr().err)
 
 
+def lens_of(monkeypatch: pytest.MonkeyPatch, out: Path, *sources: Path) -> int:
+    """Calibrate with another calibration in the place of the real one; return the exit code."""
+    found = types.SimpleNamespace(lens=Lens.ideal((160, 120), 150.0), report=lambda: "fx 150 ± 0.1")
+    monkeypatch.setattr("core.lens_calibration.calibrate", lambda *given, **how: found)
+    files = map(str, sources or (out.with_name("a.jpg"),))
+    return main(["lens", *files, "--board", "9x6", "--square-m", "0.025", "--out", str(out)])
+
+
+def test_a_lens_takes_the_place_of_a_lens_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture, notes = tmp_path / "b1.jpg", tmp_path / "notes.txt"
+    picture.write_bytes(b"\xff\xd8 a picture")
+    notes.write_text("taken indoors")
+    assert lens_of(monkeypatch, picture, picture) == 1
+    assert f"{picture}: is one of the pictures to calibrate from" in one_sentence(capsys.readouterr().err)
+    for other in (picture, notes):
+        before = other.read_bytes()
+        assert lens_of(monkeypatch, other, tmp_path) == 1
+        assert f"{other}: exists and is no lens file" in one_sentence(capsys.readouterr().err)
+        assert other.read_bytes() == before
+    for _ in range(2):
+        assert lens_of(monkeypatch, tmp_path / "lens.yaml") == 0
+    assert read_lens(tmp_path / "lens.yaml").image_size_px == (160, 120)
+
+
+class _Gone(io.StringIO):
+    """An output whose reader has gone."""
+
+    encoding = "utf-8"
+
+    def write(self, text: str) -> int:
+        raise BrokenPipeError
+
+
+@pytest.mark.parametrize(("out", "code"), [(_Gone(), 1), (io.TextIOWrapper(io.BytesIO(), encoding="ascii"), 0)])
+def test_a_lens_is_kept_whatever_becomes_of_its_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: io.TextIOBase, code: int
+) -> None:
+    monkeypatch.setattr(sys, "stdout", out)
+    assert lens_of(monkeypatch, tmp_path / "lens.yaml") == code
+    assert read_lens(tmp_path / "lens.yaml").image_size_px == (160, 120)
+
+
 # check
 
 
@@ -324,6 +371,21 @@ def test_new_refuses_what_cannot_be_used(
     assert main(["new", str(tmp_path / "eq7"), *arguments]) == 1
     assert told in one_sentence(capsys.readouterr().err)
     assert not (tmp_path / "eq7").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere names are text")
+@pytest.mark.parametrize("unnamed", ["video", "folder"])
+def test_new_refuses_names_that_are_no_text(
+    inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], unnamed: str
+) -> None:
+    no_text = Path(os.fsdecode(os.fsencode(tmp_path) + b"/d\xfcse.mp4"))
+    shutil.copy(inputs / "video.mp4", no_text)
+    video, folder = (
+        (no_text, tmp_path / "eq7") if unnamed == "video" else (inputs / "video.mp4", no_text.with_suffix(""))
+    )
+    assert main(["new", str(folder), "--video", str(video)]) == 1
+    assert "has letters in its name that are not UTF-8; rename it" in one_sentence(capsys.readouterr().err)
+    assert not folder.exists()
 
 
 # the program itself

@@ -57,6 +57,7 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
     ("change", "told"),
     [
         (put("gone.mp4", "inputs", "video"), "gone.mp4: not found"),
+        (put("go\nne.mp4", "inputs", "video"), "go ne.mp4: not found"),
         (put("gps.csv", "inputs", "video"), "gps.csv: cannot be opened as a video"),
         (put("gone.yaml", "inputs", "lens"), "gone.yaml: not found"),
         (put("gps.csv", "inputs", "lens"), "gps.csv: is not an OpenCV FileStorage file"),
@@ -83,7 +84,19 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
         (put([50, 0], "correspondences", 4, "ground_m"), "id 5: ground_m [50, 0] lies outside the point cloud"),
         (put([], "moving_regions_px"), "moving_regions_px: none"),
         (put([[[200, 0], [210, 0], [210, 9]]], "moving_regions_px"), "moving_regions_px[0]: lies wholly outside"),
+        (
+            put([[[60, 40], [80, 60], [100, 80]]], "moving_regions_px"),
+            "moving_regions_px[0]: its corners lie in a line",
+        ),
         (put([], "targets"), "targets: none"),
+        (put(1e-4, "orthoimage", "pixel_size_m"), "orthoimage.pixel_size_m: 0.0001 is no size of a pixel in metres"),
+        (put([0, 0, 0.1, 0.1], "orthoimage", "extent_m"), "orthoimage: 10 x 10 pixels are too few"),
+        (
+            put(1200, "targets", 0, "p1_p2_m"),
+            "p1_p2_m: 1200, but its bands put P1 and P2 0.56 to 1.36 m apart; write it",
+        ),
+        (put(0.0012, "targets", 0, "p1_p2_m"), "targets[0].p1_p2_m: 0.0012, but its bands"),
+        (put(0.01, "targets", 0, "lines", "L2", "width_m"), "lines.L2.width_m: 0.01 m are 0.1 pixels of the reference"),
         (put(None, "targets", 0, "height_m"), 'targets[0].height_m: missing, but method "geometric" needs'),
         (put([-8, -8, 8, 1], "orthoimage", "extent_m"), "targets[0].lines.T1.to_m: [0, 2] lies outside orthoimage"),
         (put([0, 9.5], "targets", 0, "lines", "T1", "to_m"), "T1.to_m: [0, 9.5] appears outside the reference frame"),
@@ -107,7 +120,10 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
         (put(True, "reference_frame"), "reference_frame: input should be a valid integer, not true"),
         (put(3, "wind"), 'wind: unknown key "wind"'),
         (
-            put({"from_m": [-2, 4], "to_m": [2, 4]}, "targets", 0, "lines", "L1"),
+            lambda document: (
+                put({"from_m": [-2, 4], "to_m": [2, 4]}, "targets", 0, "lines", "L1")(document),
+                put(None, "targets", 0, "p1_p2_m")(document),
+            ),
             "targets.roof.lines.L1 ",
         ),
         (put([[[-9, -9], [170, -9], [170, 130], [-9, 130]]], "moving_regions_px"), "leave only 0 ground features"),
@@ -130,6 +146,18 @@ def test_a_corner_is_told_in_the_words_of_the_filter_before_anything_is_measured
     assert line == f"{inputs / 'project.json'}: {obstacle}."
     with pytest.raises(InputError, match=re.escape(obstacle or "")):
         high_pass(np.zeros(small_project.FRAMES), np.arange(small_project.FRAMES) / small_project.RATE_HZ, 0.1)
+
+
+@pytest.mark.parametrize("p1_p2_m", [0.02, 4.0])
+def test_without_height_a_distance_is_another_unit_only_where_no_roof_rises_so_far(
+    inputs: Path, p1_p2_m: float
+) -> None:
+    def change(document: dict[str, Any]) -> None:
+        document["method"] = "paper"
+        document["targets"][0].update(height_m=None, p1_p2_m=p1_p2_m)
+
+    (line,) = problems(inputs, change)
+    assert f"p1_p2_m: {p1_p2_m:g}, but its bands put P1 and P2 0.07 to 1.70 m apart" in line
 
 
 def test_all_problems_are_told_at_once(inputs: Path) -> None:
@@ -252,6 +280,19 @@ def test_what_lies_in_the_place_of_results_is_told_as_a_run_tells_it(tmp_path: P
     small_project.write_document(tmp_path, small_project.document())
     (tmp_path / "results").write_text("somebody's notes")
     expected = f"{tmp_path / 'results'}: File exists; move away what lies in its place, then do it again."
+    assert check_project(tmp_path) == [expected]
+    with pytest.raises(OSError, match="File exists") as refusal:
+        run_project(tmp_path)
+    assert disk_problem(refusal.value) == expected
+
+
+def test_results_that_lead_nowhere(tmp_path: Path) -> None:
+    small_project.write_inputs(tmp_path)
+    small_project.write_document(tmp_path, small_project.document())
+    (tmp_path / "results").symlink_to("away/results")
+    expected = (
+        f"{tmp_path / 'results'}: is a link to away/results, which is not there; bring that back or remove the link."
+    )
     assert check_project(tmp_path) == [expected]
     with pytest.raises(OSError, match="File exists") as refusal:
         run_project(tmp_path)

@@ -183,6 +183,22 @@ def test_text_without_names_is_understood_by_its_number_of_columns(tmp_path):
     assert read_cloud(tmp_path / "n.xyz").colour is None
 
 
+def test_lines_without_points_are_counted_and_end_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr("core.point_files._TEXT_CHUNK_LINES", 4)
+    rows = ["1 2 3", "# one", "", "4 5 6", "# two", "", "# three", "", "7 8 9"]
+    (tmp_path / "a.xyz").write_text("\n".join(rows))
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.xyz").world_m[:, 0], [1, 4, 7])
+    (tmp_path / "b.xyz").write_text("\n".join([*rows, "", "1 here 2"]))
+    with pytest.raises(InputError, match="line 11 does not hold 3 numbers"):
+        read_cloud(tmp_path / "b.xyz")
+
+
+def test_colours_may_be_parts_of_one(tmp_path):
+    for head in ("", "//X Y Z Rf Gf Bf\n"):
+        np.savetxt(tmp_path / "a.txt", np.column_stack([SAMPLE, COLOURS / 255]), fmt="%.6f", header=head, comments="")
+        np.testing.assert_array_equal(read_cloud(tmp_path / "a.txt").colour, COLOURS)
+
+
 @pytest.mark.parametrize("separator", [";", " ", "\t"])
 def test_decimal_commas_are_read_where_commas_separate_no_columns(tmp_path, separator):
     rows = [separator.join(f"{value:.3f}".replace(".", ",") for value in row) for row in SAMPLE]
@@ -294,6 +310,18 @@ def with_endless_chunk_table(file):
     file.write_bytes(content)
 
 
+def with_records(count, place=100, **how):
+    """Return what writes a LAS file whose header promises so many records."""
+
+    def write(file):
+        write_las(file, **how)
+        content = bytearray(file.read_bytes())
+        struct.pack_into("<I", content, place, count)
+        file.write_bytes(content)
+
+    return write
+
+
 REFUSED = [
     ("none.laz", lambda file: None, "not found"),
     ("empty.laz", lambda file: file.touch(), "is empty"),
@@ -335,6 +363,10 @@ REFUSED = [
     ("chunks.laz", with_endless_chunk_table, "table of its compressed chunks is damaged"),
     ("scale.las", changed("a.las", struct.pack("<d", 0.001), struct.pack("<d", np.nan)), "scales or offsets"),
     ("flat.las", changed("a.las", struct.pack("<d", 0.001), struct.pack("<d", 0)), "scales or offsets"),
+    ("records.las", with_records(2**32 - 1), "promises 4294967295 records for which it has no room"),
+    ("records.laz", with_records(70_000), "promises 70000 records for which it has no room"),
+    ("last.las", with_records(2**32 - 1, 243, point_format=7), "promises 4294967295 records for which it has no room"),
+    ("whole.csv", lambda file: file.write_text("6,370,2,698,0,410\n7,100,3,200,0,11\n"), "half as many with decimal"),
     ("less.ply", changed("a.ply", b"vertex 500", b"vertex -5"), "header line `element vertex -5` is not PLY"),
     ("more.ply", changed("a.ply", b"vertex 500", b"vertex 500000000000000"), "ends after 500 of 500000000000000"),
     ("twice.ply", changed("a.ply", b"double y", b"double x"), "header is inconsistent"),

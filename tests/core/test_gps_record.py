@@ -28,6 +28,7 @@ def test_reads_named_columns_and_passes_over_the_rest(tmp_path: Path, separator:
     np.testing.assert_allclose(record.time_s, [0, 0.1, 0.2, 0.3])
     np.testing.assert_allclose(record.position_m, [[1.5, 2.5], [1.6, 2.6], [1.7, 2.7], [1.8, 2.8]])
     assert not record.position_m.flags.writeable
+    assert record.name == str(file)
 
 
 @pytest.mark.parametrize(

@@ -157,6 +157,7 @@ def test_file_of_opencvs_own_samples_with_four_coefficients(tmp_path):
         ("1500., 0., 960.", "1500., 0., 9600.", "centre far outside"),
         ("cols: 3", "cols: 2", "camera_matrix"),
         ("cols: 4", "cols: 3", "distortion_coefficients"),
+        ("cols: 4\n   dt: d", "cols: 4\n   dt: i", "distortion_coefficients has dt: i, which cuts off its decimals"),
         ("distortion_coefficients:", "coefficients:", "distortion_coefficients is missing"),
         (
             "cols: 4\n   dt: d\n   data: [ 0.1, -0.05, 0., 0. ]",
@@ -187,6 +188,11 @@ def test_a_wrong_file_is_refused_by_name(tmp_path, old, new, message):
         read_lens(file)
     assert str(file) in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+def test_a_matrix_of_whole_numbers_is_one(tmp_path):
+    (tmp_path / "lens.yaml").write_text(GOOD.replace("dt: d", "dt: i", 1))
+    np.testing.assert_array_equal(read_lens(tmp_path / "lens.yaml").focal_px, 1500)
 
 
 @pytest.mark.parametrize(

@@ -142,13 +142,21 @@ def test_default_extent_beyond_the_limit_is_cut_and_said_so(monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (Settings(pixel_size_m=0.0001, extent_m=EXTENT), r"60000 x 40000 pixels is too large.*0\.001 or more"),
-        (Settings(pixel_size_m=1.0, extent_m=EXTENT), r"6 x 4 pixels is too small"),
-        (Settings(pixel_size_m=0.02, extent_m=(0.0, 0.0, 6.0, 4.0)), r"holds no points.*correct orthoimage\.extent_m"),
+        (Settings(pixel_size_m=0.0001), r"orthoimage\.pixel_size_m: 0\.0001 is no size .* choose one of 0\.001 to 1\."),
+        (Settings(pixel_size_m=10.0), r"orthoimage\.pixel_size_m: 10 is no size"),
+        (
+            Settings(pixel_size_m=0.01, extent_m=(0.0, 0.0, 600.0, 400.0)),
+            r"60000 x 40000 pixels are too many.*0\.064 or",
+        ),
+        (Settings(pixel_size_m=1.0, extent_m=EXTENT), r"orthoimage: 6 x 4 pixels are too few"),
+        (
+            Settings(pixel_size_m=0.02, extent_m=(0.0, 0.0, 6.0, 4.0)),
+            r"orthoimage\.extent_m: holds no points.*correct it",
+        ),
     ],
 )
 def test_absurd_rasters_are_refused(settings, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=f"^project.json: .*{message}"):
         ortho_of(lattice(0.1), settings)
 
 

@@ -21,8 +21,10 @@ from core.project import (
 )
 
 BANDS = {name: {"from_m": [0.0, 0.0], "to_m": [1.0, 0.0]} for name in ("L1", "L2", "T1")}
+PAIR = {"id": 1, "ground_m": [481250.25, 5812340.5], "frame_px": [1.0, 2.0]}
 ROOF = {"name": "roof", "lines": BANDS}
 FULL: dict[str, Any] = {
+    "rooftrack": 1,
     "name": 'Bâtiment "A", [west]',
     "inputs": {"video": "video.mp4", "gps": {"file": "gps.csv", "at_m": [1.0, 2.0]}},
     "correspondences": [{"id": 1, "ground_m": [481250.25, 5812340.5], "frame_px": [1.0, 2.0], "enabled": False}],
@@ -57,7 +59,7 @@ def test_the_file_is_for_people_too() -> None:
 
 
 def test_what_is_not_said_has_its_default() -> None:
-    project = parse_project('{"name": "EQ7", "inputs": {"video": "v.mp4"}}')
+    project = parse_project('{"rooftrack": 1, "name": "EQ7", "inputs": {"video": "v.mp4"}}')
     assert (project.method, project.reference_frame, project.drift.filter) == ("geometric", 0, "none")
     assert project.orthoimage.pixel_size_m == 0.01
     assert project.targets == ()
@@ -89,7 +91,21 @@ def test_excluded_ranges_hold_both_their_ends() -> None:
         (changed(name=""), "name: "),
         (changed(wind=3), 'wind: unknown key "wind", remove it or correct its spelling'),
         (changed(rooftrack=2), "rooftrack: "),
+        (changed(rooftrack=True), "rooftrack: must be the whole number 1"),
+        (changed(rooftrack=1.0), "rooftrack: must be the whole number 1"),
         (changed(reference_frame=-1), "reference_frame: "),
+        (
+            changed(correspondences=[{**PAIR, "enabled": "yes"}]),
+            "correspondences[0].enabled: input should be a valid b",
+        ),
+        (changed(correspondences=[{**PAIR, "enabled": 0}]), "correspondences[0].enabled: input should be a valid bool"),
+        (
+            changed(correspondences=[{**PAIR, "ground_m": [1e308, 0]}]),
+            "correspondences[0].ground_m[0]: input should be",
+        ),
+        (changed(correspondences=[{**PAIR, "frame_px": [0, -1e9]}]), "correspondences[0].frame_px[1]: input should be"),
+        (changed(moving_regions_px=[[[0, 0], [1e10, 0], [0, 9]]]), "moving_regions_px[0][1][0]: input should be less"),
+        (changed(targets=[{**ROOF, "height_m": 1e308}]), "targets[0].height_m: input should be less than or equal to"),
         (changed(reference_frame=1.0), "reference_frame: "),
         (changed(correspondences=FULL["correspondences"] * 2), "correspondences: id 1 is used twice"),
         (changed(moving_regions_px=[[[0, 0], [1, 1]]]), "moving_regions_px: region 0 has 2 corners; a polygon needs"),
@@ -131,6 +147,14 @@ def test_every_problem_is_told_at_once() -> None:
         parse_project(json.dumps(changed(wind=3, method="both", reference_frame=-1)), "eq7/project.json")
     assert str(refused.value).startswith("eq7/project.json: ")
     assert str(refused.value).count(";") == 2
+
+
+def test_a_file_says_what_it_is() -> None:
+    document = changed()
+    del document["rooftrack"]
+    with pytest.raises(InputError, match=r'^eq7/project\.json: rooftrack: missing, add it: "rooftrack": 1\.$'):
+        parse_project(json.dumps(document), "eq7/project.json")
+    assert Project.model_validate(document).rooftrack == 1
 
 
 def test_a_long_value_is_told_in_short() -> None:

@@ -67,7 +67,7 @@ def parsed(html: str) -> Balanced:
 def project(**changes: Any) -> Project:
     band = '{"from_m": [0, 0], "to_m": [5, 0]}'
     made = parse_project(
-        f"""{{"name": "EQ9", "inputs": {{"video": "video.mp4"}}, "excluded_frames": [[812, 840]],
+        f"""{{"rooftrack": 1, "name": "EQ9", "inputs": {{"video": "video.mp4"}}, "excluded_frames": [[812, 840]],
         "targets": [{{"name": "roof", "height_m": 18.3, "p1_p2_m": 1.22,
                       "lines": {{"L1": {band}, "L2": {band}, "T1": {band}}}}}],
         "intervals_s": {{"pre_event": [0.0, 9.0], "event": [10.0, 24.0], "residual": [27.0, 30.0]}}}}"""
@@ -211,7 +211,8 @@ def test_paper_method_with_filter_says_what_it_cannot() -> None:
     html = report_html(
         content(
             project=parse_project(
-                '{"name": "EQ7", "inputs": {"video": "v.mp4"}, "method": "paper", "drift": {"filter": "high-pass"}}'
+                '{"rooftrack": 1, "name": "EQ7", "inputs": {"video": "v.mp4"}, "method": "paper", '
+                '"drift": {"filter": "high-pass"}}'
             ),
             targets=[],
         )
@@ -225,7 +226,7 @@ def test_paper_method_with_filter_says_what_it_cannot() -> None:
 
 def test_what_p1_and_p2_are_is_said_of_each_kind_of_target() -> None:
     points = parse_project(
-        """{"name": "EQ7", "inputs": {"video": "v.mp4"}, "targets": [{"name": "roof", "kind": "points",
+        """{"rooftrack": 1, "name": "EQ7", "inputs": {"video": "v.mp4"}, "targets": [{"name": "roof", "kind": "points",
         "height_m": 9.0, "region_m": [[0, 0], [5, 0], [5, 5]]}]}"""
     )
     assert "two points of the target&#x27;s region" in report_html(content(project=points, targets=[]))

@@ -69,8 +69,16 @@ def test_too_few_samples_tell_no_lag() -> None:
 def test_times_in_milliseconds_share_nothing_with_the_video() -> None:
     time_s, moved = video()
     record = gps_with_lag(-5.0)
-    with pytest.raises(InputError, match="share nothing with the measured video"):
-        compare_with_gps(time_s, moved, GpsRecord("gps.csv", 1000 * record.time_s + 60e3, record.position_m), INTERVALS)
+    for start_ms in (60e3, -5e3):
+        in_ms = GpsRecord("eq7/gps.csv", 1000 * record.time_s + start_ms, record.position_m)
+        try:
+            told = compare_with_gps(time_s, moved, in_ms, INTERVALS).message
+        except InputError as error:
+            told = str(error)
+            assert told.startswith("eq7/gps.csv: its times, ")
+            assert "share nothing with the measured video" in told
+        assert "its samples lie 100 s apart, as if times were in milliseconds: divide them by 1000; " in told
+        assert "eq7" not in told or start_ms == 60e3
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def write(
     options: dict[str, str] | None = None,
 ) -> Path:
     """Write a video with B-frames and a key frame every twelve frames; ticks are thousandths of a second."""
-    with av.open(str(file), "w") as container:
+    with av.open(str(file.absolute()), "w") as container:
         stream = container.add_stream(codec, rate=25, options={"bf": "3", "g": "12", **(options or {})})
         stream.width, stream.height = size
         stream.pix_fmt = pix_fmt
@@ -68,14 +68,20 @@ def write(
 def _turned(file: Path, rotation: int) -> None:
     """Set the display matrix of an MP4 file: the turn, clockwise, that a player must make."""
     cosine, sine = {90: (0, 1), 180: (-1, 0), 270: (0, -1)}[rotation]
+    _shown_by(file, (cosine, sine, -sine, cosine))
+
+
+def _shown_by(file: Path, matrix: tuple[float, float, float, float]) -> None:
+    """Set the four numbers of an MP4 file's display matrix that turn, stretch and mirror."""
     one = 1 << 16
-    unturned = b"".join(value.to_bytes(4, "big", signed=True) for value in (one, 0, 0, 0, one, 0, 0, 0, 1 << 30))
-    turned = (cosine * one, sine * one, 0, -sine * one, cosine * one, 0, 0, 0, 1 << 30)
+    a, b, c, d = (round(one * number) for number in matrix)
+    as_filmed, shown = (
+        b"".join(value.to_bytes(4, "big", signed=True) for value in numbers)
+        for numbers in ((one, 0, 0, 0, one, 0, 0, 0, 1 << 30), (a, b, 0, c, d, 0, 0, 0, 1 << 30))
+    )
     content = file.read_bytes()
-    place = content.index(b"tkhd")
-    at = content.index(unturned, place)
-    matrix = b"".join(value.to_bytes(4, "big", signed=True) for value in turned)
-    file.write_bytes(content[:at] + matrix + content[at + len(matrix) :])
+    at = content.index(as_filmed, content.index(b"tkhd"))
+    file.write_bytes(content[:at] + shown + content[at + len(shown) :])
 
 
 @pytest.fixture(scope="module")
@@ -177,6 +183,19 @@ def test_turned_frames_are_made_upright(tmp_path: Path, rotation: int, corner: t
     assert luma[corner] > 200
 
 
+@pytest.mark.parametrize(
+    ("matrix", "how"),
+    [((-1, 0, 0, 1), "mirrored"), ((0, 1, 1, 0), "mirrored"), ((0.7071, 0.7071, -0.7071, 0.7071), "turned by 45 deg")],
+)
+def test_what_is_not_to_be_shown_in_quarter_turns_is_refused(
+    tmp_path: Path, matrix: tuple[float, float, float, float], how: str
+) -> None:
+    file = write(tmp_path / "shown.mp4", frames=3)
+    _shown_by(file, matrix)
+    with pytest.raises(InputError, match=f"shown.mp4: says that it is to be shown {how}"):
+        probe(file)
+
+
 # --- what is said of a video before it is measured -------------------------------------------------------------------
 
 
@@ -240,6 +259,14 @@ def test_odd_sizes_have_no_padding(tmp_path: Path) -> None:
 
 
 # --- bad videos ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["eq7-12:30:05.mp4", "file:b.mp4", "http:c.mp4"])
+def test_a_colon_in_a_name_is_no_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    write(tmp_path / name, frames=3)
+    monkeypatch.chdir(tmp_path)
+    assert probe(Path(name)).width == SIZE[0]
+    assert read_frame(Path(name), 1).luma.shape == SIZE[::-1]
 
 
 def test_no_such_file(tmp_path: Path) -> None:
