@@ -186,9 +186,7 @@ def _lens(options: argparse.Namespace) -> int:
         )
     progress.close()
     write_lens(options.out, calibration.lens)
-    # Not every terminal knows all the letters of the report.
-    encoding = sys.stdout.encoding or "utf-8"
-    print(calibration.report().encode(encoding, "replace").decode(encoding))
+    print(calibration.report())
     print(f"Lens: {options.out}")
     return 0
 

@@ -148,8 +148,8 @@ def history(
 ) -> dict[str, Any]:
     """Return a target's displacement, column by column as in its CSV; null where nothing was measured.
 
-    `is_earlier` tells that the project cannot be solved as it stands: this is what the last run wrote. `unfiltered` asks
-    for what the method measured, whatever filter the project applies to it.
+    `is_earlier` tells that the project cannot be solved as it stands: this is what the last run wrote. `unfiltered`
+    asks for what the method measured, whatever filter the project applies to it.
     """
     project = folder.load().project
     if unfiltered:
