@@ -35,9 +35,9 @@ from core.project import (
     Band,
     Lines,
     Project,
-    Target,
     file_problems,
     naming_file,
+    project_doubts,
     read_project,
 )
 from core.roof_level import distance_obstacle, height_obstacle, scale_obstacle
@@ -106,12 +106,15 @@ def check_warnings(folder: Path) -> list[str]:
 
     None of it is told of a project or a video that cannot be read: that is a problem.
     """
+    told: list[str] = []
     try:
-        video = file_at(folder, read_project(folder).inputs.video)
-        told = video_warnings(str(video), probe(video), float(frame_index(video).time_s[-1]))
-        return [_in_a_line(warning) for warning in told]
+        project = read_project(folder)
+        told += [f"{folder / PROJECT_FILE}: {doubt}" for doubt in project_doubts(project)]
+        video = file_at(folder, project.inputs.video)
+        told += video_warnings(str(video), probe(video), float(frame_index(video).time_s[-1]))
     except InputError:
-        return []
+        pass
+    return [_in_a_line(warning) for warning in told]
 
 
 def results_obstacle(folder: Path) -> str | None:
@@ -287,7 +290,7 @@ def _overlaps_frame(region_px: Floats, info: VideoInfo) -> bool:
 def _target_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
     for number, target in enumerate(project.targets):
         place = f"targets[{number}]"
-        for name, (x, y) in _corners(target):
+        for name, (x, y) in target.corners:
             extent = project.orthoimage.extent_m
             if extent and not (extent[0] <= x <= extent[2] and extent[1] <= y <= extent[3]):
                 yield f"{place}.{name}: [{x:g}, {y:g}] lies outside orthoimage.extent_m; move it or enlarge the extent"
@@ -295,17 +298,6 @@ def _target_problems(project: Project, inputs: _Inputs) -> Iterator[str]:
                 u, v = inputs.reference.raw_from_plan(np.array([[x, y]]))[0]
                 if not is_in_frame((float(u), float(v)), inputs.info.width, inputs.info.height):
                     yield f"{place}.{name}: [{x:g}, {y:g}] appears outside the reference frame; move it"
-
-
-def _corners(target: Target) -> Iterator[tuple[str, tuple[float, float]]]:
-    if target.kind == "points":
-        for number, corner in enumerate(target.region_m or ()):
-            yield f"region_m[{number}]", corner
-    elif target.lines is not None:
-        for name in LINE_NAMES:
-            band: Band = getattr(target.lines, name)
-            yield f"lines.{name}.from_m", band.from_m
-            yield f"lines.{name}.to_m", band.to_m
 
 
 def _line_obstacles(lines: Lines, place: str) -> Iterator[str]:

@@ -29,7 +29,7 @@ def disk_problem(error: OSError) -> str:
         file = next((parent for parent in Path(file).parents if parent.is_file()), file)
     where = f"{os.fsdecode(file)}: " if isinstance(file, str | bytes | os.PathLike) else ""
     if error.errno == errno.EEXIST and isinstance(file, str | os.PathLike) and _leads_nowhere(Path(file)):
-        return f"{where}is a link to {os.readlink(file)}, which is not there; bring that back or remove the link."
+        return f"{where}is a link to {os.readlink(Path(file))}, which is not there; bring that back or remove the link."
     if error.errno in DISK_FULL:
         remedy = "make room on the disk"
     elif error.errno in OBSTRUCTED:

@@ -7,6 +7,7 @@ Only the file's own consistency is checked here; whether the inputs fit together
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -38,6 +39,13 @@ Interval = tuple[Finite, Finite]
 Method = Literal["geometric", "paper"]
 
 LINE_NAMES = ("L1", "L2", "T1")
+
+# Intervals that touch, or that a person drew this far into one another, are as they were meant.
+_TOUCHING_S = 0.1
+# An antenna farther from where its target appears than this, and than this many times the target's height, by which
+# high places appear displaced, is in other coordinates.
+_FAR_M = 50.0
+_FAR_HEIGHTS = 3.0
 
 
 def _named(file: str) -> str:
@@ -146,6 +154,18 @@ class Target(Model):
         if self.kind == "points" and (self.region_m is None or len(self.region_m) < 3):
             raise ValueError('a target of kind "points" needs "region_m" with three or more corners')
         return self
+
+    @property
+    def corners(self) -> Iterator[tuple[str, Point]]:
+        """The key and the place, plan metres, of each end of its bands or each corner of its region."""
+        if self.kind == "points":
+            for number, corner in enumerate(self.region_m or ()):
+                yield f"region_m[{number}]", corner
+        elif self.lines is not None:
+            for name in LINE_NAMES:
+                band: Band = getattr(self.lines, name)
+                yield f"lines.{name}.from_m", band.from_m
+                yield f"lines.{name}.to_m", band.to_m
 
 
 class Intervals(Model):
@@ -291,6 +311,29 @@ def parse_project(text: str, file: Path | str = PROJECT_FILE) -> Project:
     if problems:
         raise InputError(f"{file}: " + "; ".join(problems) + ".")
     return Project.model_validate(document)
+
+
+def project_doubts(project: Project) -> Iterator[str]:
+    """Yield what keeps nothing from being measured but cannot be meant, in sentences that begin with its place."""
+    times = project.intervals_s
+    for first, then in (("pre_event", "event"), ("event", "residual"), ("pre_event", "residual")):
+        before, after = getattr(times, first), getattr(times, then)
+        if before is None or after is None:
+            continue
+        shared_s = min(before[1], after[1]) - max(before[0], after[0])
+        if shared_s >= _TOUCHING_S:
+            yield f"intervals_s: {first} and {then} share {shared_s:.1f} s; let one end before the other begins."
+        elif before[0] > after[0]:
+            yield f"intervals_s: {first} lies after {then}; correct them."
+    gps = project.inputs.gps
+    places = [corner for target in project.targets for _, corner in target.corners]
+    if gps is not None and gps.at_m is not None and places:
+        nearest_m = min(math.dist(gps.at_m, place) for place in places)
+        if nearest_m > _FAR_M + _FAR_HEIGHTS * max(abs(target.height_m or 0.0) for target in project.targets):
+            yield (
+                f"inputs.gps.at_m: [{gps.at_m[0]:g}, {gps.at_m[1]:g}] lies {nearest_m:.0f} m from the nearest target; "
+                "give the antenna's place in the coordinates of the cloud."
+            )
 
 
 @contextmanager

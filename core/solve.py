@@ -13,7 +13,7 @@ from core.drift import high_pass
 from core.intervals import during
 from core.lens import Lens
 from core.measurements import Recording
-from core.project import Drift, Intervals, Project, Target
+from core.project import Drift, Intervals, Project, Target, project_doubts
 from core.relief import Relief
 from core.repeats import repeated_pictures, repeats_sentence, without_pictures
 from core.results import TargetHistory, relative_history
@@ -45,6 +45,7 @@ def solve(
         solution = solve_geometric(recording, project, lens, relief)
     contradiction = solution.reference.contradiction
     warnings = (
+        *project_doubts(project),
         *([f"{contradiction}."] if contradiction else []),
         *([repeats_sentence(recording, repeated)] if repeated.any() else []),
         *solution.warnings,

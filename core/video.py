@@ -24,6 +24,7 @@ from typing import BinaryIO
 import av
 import numpy as np
 from av.container import InputContainer
+from av.sidedata.sidedata import SideData
 from av.stream import Disposition
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
@@ -194,7 +195,7 @@ def _require_turned_only(path: File, frame: VideoFrame) -> None:
     Source: FFmpeg, libavutil/display.h: the matrix's first two rows hold two numbers each and one for perspective.
     """
     matrix = frame.side_data.get("DISPLAYMATRIX")
-    if matrix is None:
+    if not isinstance(matrix, SideData):
         return
     a, b, _, c, d = np.frombuffer(memoryview(matrix), dtype=np.int32)[:5].astype(np.float64)
     mirrored = a * d - b * c < 0

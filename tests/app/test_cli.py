@@ -300,6 +300,16 @@ def test_check_warns_of_what_can_be_measured_all_the_same(tmp_path: Path, capsys
     assert ready.endswith("ready to run.")
 
 
+def test_check_warns_of_what_cannot_be_meant(inputs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = small_project.document()
+    document["intervals_s"]["event"] = [0.2, 1.4]
+    small_project.write_document(inputs, document)
+    assert main(["check", str(inputs)]) == 0
+    warning, ready = capsys.readouterr().out.splitlines()
+    assert warning.startswith(f"Warning: {inputs / 'project.json'}: intervals_s: pre_event and event share 0.3 s")
+    assert ready.endswith("ready to run.")
+
+
 def test_check_says_each_problem_in_a_line(inputs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     document = small_project.document()
     document["targets"] = []

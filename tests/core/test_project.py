@@ -14,6 +14,7 @@ from core.project import (
     Project,
     naming_file,
     parse_project,
+    project_doubts,
     project_json,
     project_problems,
     read_project,
@@ -147,6 +148,34 @@ def test_every_problem_is_told_at_once() -> None:
         parse_project(json.dumps(changed(wind=3, method="both", reference_frame=-1)), "eq7/project.json")
     assert str(refused.value).startswith("eq7/project.json: ")
     assert str(refused.value).count(";") == 2
+
+
+def doubts_of(**changes: Any) -> list[str]:
+    return list(project_doubts(Project.model_validate(changed(**changes))))
+
+
+@pytest.mark.parametrize(
+    ("intervals_s", "told"),
+    [
+        ({"pre_event": [0, 10], "event": [10, 20], "residual": [19.95, 30]}, []),
+        ({"pre_event": [0, 12], "event": [10, 20]}, ["pre_event and event share 2.0 s"]),
+        ({"pre_event": [25, 30], "event": [10, 20]}, ["pre_event lies after event"]),
+        ({"event": [10, 20], "residual": [15, 30]}, ["event and residual share 5.0 s"]),
+    ],
+)
+def test_intervals_that_cannot_be_meant_are_doubted(intervals_s: dict[str, Any], told: list[str]) -> None:
+    found = doubts_of(intervals_s=intervals_s)
+    assert len(found) == len(told)
+    assert all(part in doubt for part, doubt in zip(told, found, strict=True))
+
+
+def test_an_antenna_far_from_every_target_is_doubted() -> None:
+    for at_m, height_m, far in ((40, None, False), (90, None, True), (90, 20.0, False), (478_000, 20.0, True)):
+        found = doubts_of(
+            inputs={"video": "v.mp4", "gps": {"file": "gps.csv", "at_m": [at_m, 0]}},
+            targets=[{**ROOF, "height_m": height_m}],
+        )
+        assert [doubt.partition(":")[0] for doubt in found] == (["inputs.gps.at_m"] if far else [])
 
 
 def test_a_file_says_what_it_is() -> None:

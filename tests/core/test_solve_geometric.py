@@ -202,6 +202,12 @@ def test_a_pre_event_of_a_few_frames_is_told() -> None:
     assert any("roof was measured in only" in warning and "choose a longer pre_event" in warning for warning in told)
 
 
+def test_intervals_that_cannot_be_meant_are_told() -> None:
+    document = scene.project_document(intervals_s={"pre_event": [0.0, 3.5], "event": [3.0, 6.0]})
+    told = solve(scene.recording(NOISE_PX), document, scene.LENS).warnings
+    assert told[0] == "intervals_s: pre_event and event share 0.5 s; let one end before the other begins."
+
+
 def test_a_height_that_the_cloud_does_not_show_is_told() -> None:
     recording, document = scene.recording(NOISE_PX), scene.project_document()
     west, south = scene.SITE_M - 30.0
