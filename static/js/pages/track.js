@@ -8,6 +8,7 @@ import { told } from "../lib/problems.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { busyOver } from "../components/busy.js";
 import { stepUrl } from "../components/header.js";
+import { filterBadge } from "../components/filter-badge.js";
 import { AXES, fetchHistory, fetchResults, methodName, METHODS } from "../components/histories.js";
 import { isRunning, stageWords } from "../components/job-card.js";
 import { note } from "../components/notes.js";
@@ -51,7 +52,7 @@ const controls = h("section", { class: "section", "aria-label": "Measurement" })
 const methods = h(
   "section",
   { class: "section" },
-  h("header", {}, h("h2", {}, "Method")),
+  h("header", {}),
   h("div", { class: "choices", role: "radiogroup", "aria-label": "Method" }),
 );
 const facts = h("section", { class: "section", "aria-label": "Result" });
@@ -419,6 +420,7 @@ function doneWords() {
 }
 
 function showMethods() {
+  fill(find("header", HTMLElement, methods), h("h2", {}, "Method"), filterBadge(store));
   const box = find(".choices", HTMLElement, methods);
   const focused = box.contains(document.activeElement);
   fill(
