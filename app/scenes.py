@@ -135,8 +135,8 @@ def _ground(site: Site) -> GroundView:
     plane = site.plane
     size = float(np.sqrt(max(plane.area_m2, 1.0))) * 1.2
     label = (
-        f"Ground plane z = {round(plane.at_m[2], 2) + 0.0:.2f} m, tilt {np.degrees(plane.tilt_rad):.2f} deg, "
-        f"elevation spread {100 * plane.elevation_std_m:.1f} cm"
+        f"Ground plane z = {round(plane.at_m[2], 2) + 0.0:.2f} m, tilt {np.degrees(plane.tilt_rad):.2f}°, "
+        f"spread {1000 * plane.elevation_std_m:.0f} mm"
     )
     return GroundView(np.array(plane.at_m), plane.slope, size, label)
 

@@ -279,22 +279,27 @@ def _pre_event_warnings(after: Floats, times: Floats, intervals: Intervals, corn
     for axis, name in enumerate(AXIS_NAMES):
         if remaining[axis] > ACCEPTABLE_PRE_EVENT_RMS_M:
             warnings.append(
-                f"The pre-event still moves by {100 * remaining[axis]:.1f} cm RMS along {name}, where it should "
-                f"stand still; the paper accepts less than {100 * ACCEPTABLE_PRE_EVENT_RMS_M:.0f} cm."
+                f"The pre-event interval still moves by {100 * remaining[axis]:.1f} cm RMS along {name}, where it "
+                f"should stand still; the paper accepts less than {100 * ACCEPTABLE_PRE_EVENT_RMS_M:.0f} cm."
             )
     return warnings
 
 
 def _frequency_warnings(before: Floats, times: Floats, intervals: Intervals, corner_hz: float) -> list[str]:
-    """A corner at which the building itself moves."""
-    warnings = []
+    """A corner at which the building itself moves, or above that."""
+    near, above = [], []
     for axis, name in enumerate(AXIS_NAMES):
         dominant_hz = dominant_frequency(before[:, axis], times, intervals)
-        if dominant_hz is not None and corner_hz > 0.5 * dominant_hz:
-            warnings.append(
-                f"The corner frequency, {corner_hz:.2f} Hz, comes near {dominant_hz:.2f} Hz, at which the target moves "
-                f"most along {name} during the event; the filter takes away real motion."
-            )
+        if dominant_hz is None or corner_hz <= 0.5 * dominant_hz:
+            continue
+        (above if corner_hz > dominant_hz else near).append(f"{dominant_hz:.2f} Hz along {name}")
+    corner = f"The corner frequency, {corner_hz:.2f} Hz,"
+    most = "where the target moves most during the event; the filter takes away"
+    warnings = []
+    if near:
+        warnings.append(f"{corner} comes near {' and '.join(near)}, {most} real motion.")
+    if above:
+        warnings.append(f"{corner} lies above {' and '.join(above)}, {most} most of the motion.")
     return warnings
 
 

@@ -598,7 +598,7 @@ def test_the_engines_sentences_are_told_in_words_of_the_pages(browser, project):
             "correspondences",
         ),
         "no correspondence is enabled, at least four are needed.": (
-            "No correspondence is enabled, at least four are needed.",
+            "No correspondence is in use yet, at least four are needed.",
             "correspondences",
         ),
         "/w/p/gps.csv: is empty; export it again.": ("gps.csv: is empty; export it again.", None),

@@ -47,7 +47,14 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
         page.wait_for_function("() => parseInt(document.querySelector('.figures .value')?.textContent) > 5")
         expect(page.locator("[data-step=track]")).to_have_attribute("data-status", "running")
         expect(page.locator(".toast")).to_have_count(0)
+        held: list[Route] = []
+        page.route("**/track", lambda route: held.append(route) if route.request.method == "GET" else route.continue_())
         page.get_by_role("button", name="Cancel").click()
+        expect(page.get_by_text("Reading what was kept…")).to_be_visible()
+        expect(page.get_by_role("button", name="Start")).to_have_count(0)
+        page.keyboard.press("r")  # what would be started is not known yet
+        arrived(page, held).continue_()
+        page.unroute("**/track")
         expect(page.locator("[data-step=track]")).to_have_attribute("data-status", "warn")
         expect(page.get_by_role("button", name="Resume")).to_be_visible()
     with serving(tmp_path, port) as address, watched(browser, address) as page:

@@ -365,7 +365,15 @@ def test_two_targets_never_share_a_result_file(browser, project):
         page.get_by_role("menuitem", name="Rename…").click()
         page.get_by_role("dialog").get_by_role("textbox").fill("ROOF")
         page.keyboard.press("Enter")
-        expect(page.locator(".toast")).to_contain_text("would share a result file")
+        refused = page.get_by_role("dialog").get_by_role("alert")
+        expect(refused).to_contain_text("would share a result file")
+        page.get_by_role("dialog").get_by_role("textbox").fill("_table")
+        page.keyboard.press("Enter")
+        expect(refused).to_contain_text("a letter or digit first")
+        page.get_by_role("dialog").get_by_role("textbox").fill(" ")
+        page.keyboard.press("Enter")
+        expect(refused).to_have_text("A name, please.")
+        page.keyboard.press("Escape")
         expect(page.locator("#targets li[data-target=table]")).to_be_visible()
     assert [target.name for target in read_project(folder).targets] == ["roof"]
 

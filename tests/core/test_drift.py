@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import time
 
 import numpy as np
@@ -220,9 +221,20 @@ def test_warnings_name_residual_frequency_and_restless_pre_event() -> None:
     moved = np.column_stack([drift_below(0.25, time_s, seed=6, rms_m=0.06) + residual, burst(time_s, 0.4, 0.3)])
     warnings = filter_warnings(moved, high_pass(moved, time_s, 0.25), time_s, INTERVALS, corner_hz=0.25)
     assert any("removes the residual displacement: along x (east) 2" in text and "2" in text for text in warnings)
-    assert any("comes near 0.4" in text and "along y (north)" in text for text in warnings)
+    assert any("comes near" in text and re.search(r" 0\.4\d Hz along y \(north\)", text) for text in warnings)
     slow = filter_warnings(moved, high_pass(moved, time_s, 0.05), time_s, INTERVALS, corner_hz=0.05)
     assert any("the paper accepts less than 1 cm" in text for text in slow)
+
+
+def test_a_corner_above_the_frequency_of_the_motion_is_told_once_for_both_axes() -> None:
+    time_s = clock(60)
+    moved = np.column_stack([burst(time_s, 2.5, 0.3), burst(time_s, 2.5, 0.2)])
+    event = Intervals(event=INTERVALS.event)
+    (warning,) = filter_warnings(moved, high_pass(moved, time_s, 3.0), time_s, event, corner_hz=3.0)
+    assert re.search(r"lies above 2\.\d+ Hz along x \(east\) and 2\.\d+ Hz along y \(north\), ", warning)
+    assert warning.endswith("takes away most of the motion.")
+    (near,) = filter_warnings(moved, high_pass(moved, time_s, 1.5), time_s, event, corner_hz=1.5)
+    assert "comes near 2." in near
 
 
 def test_a_residual_that_drift_hides_is_seen_where_the_displacement_is_free_of_drift() -> None:

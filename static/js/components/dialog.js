@@ -3,6 +3,7 @@
 
 import { h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
+import { fieldWords } from "./field-words.js";
 
 /** @typedef {import("../lib/dom.js").Child} Child */
 
@@ -48,11 +49,17 @@ export function openDialog({ title, body, size = "" }) {
 }
 
 /**
- * Ask for one line of text.
- * @param {{title: string, label: string, value?: string, action: string, hint?: string}} options
+ * Ask for a name.
+ * @param {object} options
+ * @param {string} options.title
+ * @param {string} options.label
+ * @param {string} options.value
+ * @param {string} options.action
+ * @param {string} [options.hint]
+ * @param {(name: string) => string | null} [options.refusal]  why a name does not do: it is told, and can be mended
  * @returns {Promise<string | null>}
  */
-export function askText({ title, label, value = "", action, hint }) {
+export function askName({ title, label, value, action, hint, refusal = () => null }) {
   return openDialog({
     title,
     size: "small",
@@ -60,27 +67,35 @@ export function askText({ title, label, value = "", action, hint }) {
       const input = h("input", {
         class: "input",
         type: "text",
-        id: "ask-text",
+        id: "ask-name",
         value,
         required: true,
         autocomplete: "off",
         spellcheck: "false",
       });
+      const words = fieldWords(input);
+      input.addEventListener("input", () => input.removeAttribute("aria-invalid"));
       const submit = (/** @type {Event} */ event) => {
         event.preventDefault();
-        if (input.value.trim() !== "") close(input.value.trim());
+        const name = input.value.trim();
+        const problem = name === "" ? "A name, please." : refusal(name);
+        if (problem === null) return close(name);
+        input.setAttribute("aria-invalid", "true");
+        input.focus();
+        words.say(problem);
       };
       const field = h(
         "div",
         { class: "field" },
-        h("label", { class: "label", for: "ask-text" }, label),
+        h("label", { class: "label", for: "ask-name" }, label),
         input,
+        words.element,
         hint && h("p", { class: "hint" }, hint),
       );
       return [
         h(
           "form",
-          { class: "dialog-form", onsubmit: submit },
+          { class: "dialog-form", novalidate: true, onsubmit: submit },
           h("div", { class: "dialog-body" }, field),
           dialogActions(() => close(null), h("button", { class: "button primary", type: "submit" }, action)),
         ),

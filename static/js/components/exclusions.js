@@ -153,8 +153,8 @@ export class ExclusionEditor {
 
   /** @param {Range} range */
   #row(range) {
-    const [first] = range;
-    const seconds = `${fixed(this.#times_s[first], 2)} s`;
+    const [first, last] = range;
+    const begin = `${first === last ? "at" : "from"} ${fixed(this.#times_s[first], 2)} s`;
     return h(
       "div",
       { class: "run-row" },
@@ -163,7 +163,7 @@ export class ExclusionEditor {
         { type: "button", class: "run-jump", onclick: () => this.onJump(first) },
         h("span", { class: "status-key excluded" }),
         h("span", { class: "number" }, rangeText(range)),
-        h("span", { class: "number faint end" }, seconds),
+        h("span", { class: "number faint end" }, begin),
       ),
       h(
         "button",

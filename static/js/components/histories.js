@@ -45,7 +45,7 @@ export const METHODS = [
   {
     value: "geometric",
     name: "Geometric",
-    line: "Camera pose of every frame from the tracked ground, roof lines cut at the roof's own height: no parallax, no filter, the residual stays.",
+    line: "Camera pose of every frame from the tracked ground, roof lines cut at the roof's own height: no parallax, and without a filter the residual stays.",
   },
   {
     value: "paper",

@@ -274,7 +274,7 @@ export class Plot extends Emitter {
       size: 48,
       gap: 6,
       font: AXIS_FONT,
-      space: 28,
+      space: (_u, _axis, _min, _max, height) => Math.min(28, Math.max(12, height / 5)), // three ticks in a low plot too
       grid: this.grid(),
       ticks: { show: false },
       values,
@@ -345,6 +345,7 @@ export class Plot extends Emitter {
       { type: "button", class: "plot-entry", "aria-pressed": String(!trace.hidden) },
       swatch,
       trace.label,
+      " ", // for who hears both
       value,
     );
     button.addEventListener("click", () => {

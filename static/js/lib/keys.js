@@ -50,12 +50,12 @@ function isTyping(target) {
 const isAtRest = ({ target, ctrlKey, metaKey }) =>
   (ctrlKey || metaKey) && target instanceof HTMLInputElement && target.dataset.atRest !== undefined;
 
-/** Whether this element uses the key itself. @param {EventTarget | null} target @param {string} name */
+/** Whether this element uses the key itself. A choice that holds already has no use for it. @param {EventTarget | null} target @param {string} name */
 function isOwnKey(target, name) {
   return (
     (name === "Enter" || name === "Space") &&
     target instanceof Element &&
-    target.closest("button, a, summary, [role=menuitem]") !== null
+    target.closest("button:not([role=radio][aria-checked=true]), a, summary, [role=menuitem]") !== null
   );
 }
 

@@ -38,6 +38,7 @@ const SAID_HERE = [
   [/correct inputs\.gps\.file of project\.json or set inputs\.gps to null/g, "choose the record again or remove it"],
   [/correct inputs\.video or put the file there/g, "choose the video again"],
   [/or set inputs\.gps to null/g, "or remove it"],
+  [/no correspondence is enabled/g, "no correspondence is in use yet"],
   [/\bin pre_event\b/g, "in the pre-event interval"],
   [/\banother pre_event\b/g, "another pre-event interval"],
   [/\bin ground_m\b/g, "on the ground"],
@@ -53,7 +54,7 @@ const ABOUT_FOLDERS = /lies outside the folders|absolute path|there is no such f
 /** @type {[RegExp, StepName][]} */
 const REMEDIES = [
   [/in the inputs|under Columns|calibrate|choose the (?:video|record) again/, "inputs"],
-  [/correspondences|collinear|enabled, at least four/, "correspondences"],
+  [/correspondence|collinear/, "correspondences"],
   [/moving region/, "regions"],
   [/track first/, "track"],
 ];

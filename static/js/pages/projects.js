@@ -7,7 +7,7 @@ import { ago, fixed } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
 import { told } from "../lib/problems.js";
 import { bindKeys } from "../lib/keys.js";
-import { askText } from "../components/dialog.js";
+import { askName } from "../components/dialog.js";
 import { STEPS, projectsHeader, statusMark, stepUrl } from "../components/header.js";
 import { menuButton } from "../components/menu.js";
 import { toast, toastError } from "../components/toast.js";
@@ -145,7 +145,7 @@ async function newProject() {
 
 /** @param {Listed} project */
 async function rename(project) {
-  const name = await askText({ title: "Rename project", label: "Name", value: project.name, action: "Rename" });
+  const name = await askName({ title: "Rename project", label: "Name", value: project.name, action: "Rename" });
   if (name === null || name === project.name) return;
   await attempt(async () => {
     const state = await get(projectPath(project.id));
@@ -159,7 +159,7 @@ async function rename(project) {
 
 /** @param {Listed} project */
 async function duplicate(project) {
-  const name = await askText({
+  const name = await askName({
     title: "Duplicate project",
     label: "Name of the copy",
     value: `${project.name} copy`,

@@ -6,6 +6,7 @@ import { setView, viewNumber, viewText } from "../lib/view-state.js";
 import { busyOver } from "../components/busy.js";
 import { earlierNote } from "../components/earlier-note.js";
 import { ExclusionEditor } from "../components/exclusions.js";
+import { filterBadge } from "../components/filter-badge.js";
 import { FrameLibrary } from "../components/frames.js";
 import { FrameView } from "../components/frame-view.js";
 import { AXES, fetchHistory, fetchResults, methodName, METHODS, worstStatuses } from "../components/histories.js";
@@ -157,7 +158,10 @@ function listen() {
   }
   page.events.on("results", () => void refresh().catch(toastError));
   page.events.on("online", () => void refresh().catch(toastError));
-  store.on("change", () => exclusions.show());
+  store.on("change", () => {
+    exclusions.show();
+    showFacts();
+  });
 }
 
 /** @returns {import("../lib/keys.js").KeyBinding[]} */
@@ -407,7 +411,7 @@ function showDoubtful() {
       h("span", { class: `status-key ${run.status}` }),
       h("span", { class: "number" }, run.first === run.last ? `${run.first}` : `${run.first}–${run.last}`),
       h("span", { class: "faint" }, run.status),
-      h("span", { class: "number faint end" }, `${fixed(player.times_s[run.first], 2)} s`),
+      h("span", { class: "number faint end" }, `${run.first === run.last ? "at" : "from"} ${fixed(player.times_s[run.first], 2)} s`),
     ),
   );
   fill(
@@ -467,8 +471,15 @@ function showFacts() {
       h("dt", {}, "Rotation"),
       h("dd", {}, turn === null || turn === undefined ? "–" : `${fixed(turn * 1000, 2)} mrad`),
       stage === "scene" ? null : featureRows(i),
+      filterRow(),
     ),
   );
+}
+
+/** The filter between what was measured and what is shown; the uncertainty is that of what was measured. */
+function filterRow() {
+  const badge = filterBadge(store);
+  return badge && [h("dt", {}, "Filter"), h("dd", {}, badge, h("span", { class: "faint" }, " σ before it"))];
 }
 
 /** What took part in a frame and what did not: known only where the frame is looked at. @param {number} frame */
@@ -496,7 +507,7 @@ function displacementCell(history, i, point, axis) {
   return h(
     "td",
     { class: "number" },
-    fixed(value * 1000, 1),
+    fixed(value * 1000, 2),
     h("span", { class: "faint" }, sigma === null ? "" : ` ± ${fixed(sigma * 1000, 2)}`),
   );
 }

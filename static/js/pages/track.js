@@ -8,6 +8,7 @@ import { told } from "../lib/problems.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { busyOver } from "../components/busy.js";
 import { stepUrl } from "../components/header.js";
+import { filterBadge } from "../components/filter-badge.js";
 import { AXES, fetchHistory, fetchResults, methodName, METHODS } from "../components/histories.js";
 import { isRunning, stageWords } from "../components/job-card.js";
 import { note } from "../components/notes.js";
@@ -37,6 +38,12 @@ let target = viewText("target") ?? "";
 let duration_s = 0;
 let starting = false;
 let drawing = 0;
+/** How often a job began or ended, as far as known here: an answer asked for before the last time is out of date. */
+let turns = 0;
+/** Questions for the results: how many were asked, and which of them has been answered last. */
+const questions = { asked: 0, answered: 0 };
+/** A job has ended, and what it kept is not known yet. */
+let reading = false;
 
 const targetChoice = segmented({ label: "Target", choices: [], value: target, onChange: chooseTarget });
 const live = h("span", { class: "badge accent", hidden: true }, "Growing as frames arrive");
@@ -45,7 +52,7 @@ const controls = h("section", { class: "section", "aria-label": "Measurement" })
 const methods = h(
   "section",
   { class: "section" },
-  h("header", {}, h("h2", {}, "Method")),
+  h("header", {}),
   h("div", { class: "choices", role: "radiogroup", "aria-label": "Method" }),
 );
 const facts = h("section", { class: "section", "aria-label": "Result" });
@@ -71,14 +78,14 @@ page.keys([
     group: "Track",
     label: "Start or resume",
     run: () => void start(false),
-    when: () => !isRunning(track.job) && !blocked(),
+    when: canStart,
   },
   {
     keys: "Shift+R",
     group: "Track",
     label: "Measure again from the first frame",
     run: () => void start(true),
-    when: () => !isRunning(track.job) && !blocked(),
+    when: canStart,
   },
   {
     keys: "C",
@@ -100,16 +107,20 @@ await catchUp();
 opened();
 await loadDuration();
 
-/** Ask for the whole state: at first, and whenever the connection was lost. */
+/** Ask for the whole state: at first, when a job has ended, and whenever the connection was lost. @returns {Promise<void>} */
 async function catchUp() {
+  const turn = turns;
   try {
-    track = await get(projectPath(page.id, "track"));
+    const [answer] = await Promise.all([get(projectPath(page.id, "track")), readResults()]);
+    if (turn !== turns) return catchUp();
+    track = answer;
     for (const [name, list] of Object.entries(track.preview ?? {})) for (const row of list) keep(name, row);
-    await loadResults();
   } catch (error) {
     toastError(error);
   }
+  reading = false;
   show();
+  await loadHistory();
 }
 
 async function loadDuration() {
@@ -118,9 +129,18 @@ async function loadDuration() {
   draw();
 }
 
+/** Take the results as they are now; an answer that comes after that to a later question is out of date. */
+async function readResults() {
+  const question = (questions.asked += 1);
+  const answer = await fetchResults(page.id).catch(() => null);
+  if (question < questions.answered) return;
+  questions.answered = question;
+  results = answer;
+}
+
 async function loadResults() {
-  results = await fetchResults(page.id).catch(() => null);
-  if (results?.ready && !isRunning(track.job)) await loadHistory();
+  await readResults();
+  await loadHistory();
   show();
 }
 
@@ -131,11 +151,13 @@ function isMeasured() {
 
 /** The finished history takes the place of what was drawn while it grew; until there is one, what was measured before. */
 async function loadHistory() {
+  if (!results?.ready || isGrowing()) return;
   const name = currentTarget();
   const method = isMeasured() ? store.project.method : results?.methods[0];
   if (!results?.targets.includes(name) && !isMeasured()) return;
   try {
     const history = await fetchHistory(page.id, name, method);
+    if (isGrowing()) return;
     rows.set(
       name,
       new Map(
@@ -155,8 +177,11 @@ async function loadHistory() {
 function onJob(job) {
   if (job.kind !== "track") return;
   const ended = isRunning(track.job) && !isRunning(job);
+  if (ended || job.id !== track.job?.id) turns += 1;
   track = { ...track, job };
   if (ended) {
+    reading = true;
+    show();
     announce(job.state === "done" ? "The measurement is finished." : `The measurement stopped. ${told(job.message ?? "").words}`);
     return void catchUp(); // what was kept, and so what can be done next, is not known before
   }
@@ -176,20 +201,32 @@ function keep(name, row) {
   rows.set(name, known.set(row[0], row));
 }
 
+/** Whether a history grows now, which nothing measured before may take the place of. */
+function isGrowing() {
+  return starting || isRunning(track.job);
+}
+
+function canStart() {
+  return !isRunning(track.job) && !reading && !blocked();
+}
+
 /** @param {boolean} fresh measure again from the first frame */
 async function start(fresh) {
   if (starting) return; // a double click
   starting = true;
+  turns += 1;
   try {
     if (fresh || !track.resumable) rows.clear();
     await store.settled();
     const { job } = await post(projectPath(page.id, "track"), { fresh });
     track = { ...track, job, message: null };
+    turns += 1;
   } catch (error) {
     toastError(error);
   }
   starting = false;
   show();
+  void loadHistory(); // where nothing was started
 }
 
 async function cancel() {
@@ -206,7 +243,7 @@ async function cancel() {
 function chooseTarget(name) {
   target = name;
   setView({ target: name });
-  if (results?.ready && !isRunning(track.job)) void loadHistory();
+  void loadHistory();
   draw();
 }
 
@@ -261,6 +298,7 @@ function draw() {
 function showControls() {
   const { job } = track;
   if (isRunning(job)) return showRunning(/** @type {Job} */ (job));
+  if (reading) return showReading();
   const problems = store.state.problems ?? [];
   const done = results?.ready && !results.stale && !track.resumable && isMeasured();
   const notes = [
@@ -272,6 +310,12 @@ function showControls() {
     ...(done ? (results?.summary?.warnings ?? []) : []).map((/** @type {string} */ warning) => note("warn", told(warning).words)),
   ];
   fill(controls, h("header", {}, h("h2", {}, "Measurement")), notes, buttons(Boolean(done)));
+}
+
+/** A job has ended: what it kept, and so what can be done next, is being asked for. */
+function showReading() {
+  const words = track.job?.state === "done" ? "Reading the result…" : "Reading what was kept…";
+  fill(controls, h("header", {}, h("h2", {}, "Measurement")), h("p", { class: "soft", role: "status" }, words));
 }
 
 /** Why the last measurement failed, as its job says or, after a restart, the step; empty where it did not. */
@@ -376,6 +420,7 @@ function doneWords() {
 }
 
 function showMethods() {
+  fill(find("header", HTMLElement, methods), h("h2", {}, "Method"), filterBadge(store));
   const box = find(".choices", HTMLElement, methods);
   const focused = box.contains(document.activeElement);
   fill(

@@ -46,10 +46,10 @@ export function pairsTable(element, { onSelect, onToggle }) {
       { key: "on", title: "On", cell: counts },
       { key: "id", title: "Pair", number: true, cell: (pair) => String(pair.id), sort: (pair) => pair.id },
       { key: "px", title: "Residual", hint: residualHint, number: true, cell: (pair) => pixels(px(pair)), sort: px },
-      { key: "cm", title: "on ground", number: true, cell: (pair) => centimetres(metres(pair)), sort: metres },
+      { key: "cm", title: "On ground", number: true, cell: (pair) => centimetres(metres(pair)), sort: metres },
       {
         key: "loo",
-        title: "Left out",
+        title: "Leave-one-out",
         hint: leftOutHint,
         number: true,
         cell: (pair) => pixels(leftOut(pair)),

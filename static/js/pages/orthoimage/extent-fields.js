@@ -25,9 +25,10 @@ export function extentFields(onChange) {
     typed = typed.with(side, value);
     tellMissing();
     const [west, south, east, north] = typed;
-    if (west !== null && south !== null && east !== null && north !== null) onChange([west, south, east, north]);
-    else if (typed.every((entry) => entry === null)) onChange(null);
+    if (west !== null && south !== null && east !== null && north !== null) save([west, south, east, north]);
+    else if (typed.every((entry) => entry === null)) save(null);
   };
+  const save = (/** @type {Extent | null} */ wanted) => wanted?.join() !== shown?.join() && onChange(wanted);
   const fields = SIDES.map((side, i) =>
     numberField({
       label: side,
@@ -50,6 +51,12 @@ export function extentFields(onChange) {
       ),
       missing,
     ),
+    /** Forget what is typed of an extent that is not whole yet. */
+    forget() {
+      typed = shown === null ? [null, null, null, null] : [...shown];
+      tellMissing();
+      fields.forEach((field, i) => field.set(typed[i]));
+    },
     /** Sides typed so far stay as long as the project's extent does. @param {Extent | null} extent @param {Extent | null} made of the orthoimage as it is */
     show(extent, made) {
       const isAsBefore = extent?.join() === shown?.join();

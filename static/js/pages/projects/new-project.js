@@ -8,7 +8,7 @@ import { chooseFiles } from "../../components/file-browser.js";
 
 const INPUTS = /** @type {const} */ ([
   { kind: "video", name: "Video", hint: "mp4, mov, mkv" },
-  { kind: "cloud", name: "Point cloud", hint: "laz, las, ply, pcd, e57, csv" },
+  { kind: "cloud", name: "Point cloud", hint: "laz, las, ply, pcd, e57; a table: csv, xyz, pts, asc, txt" },
   { kind: "lens", name: "Lens", hint: "yaml from a checkerboard; can be calibrated later" },
   { kind: "gps", name: "GPS", hint: "csv, to compare with" },
 ]);

@@ -101,6 +101,7 @@ class BandRow {
       { class: "band-head", type: "button", onclick: () => this.editor.select(this.line) },
       h("span", { class: `swatch ${this.line.toLowerCase()}` }),
       h("strong", {}, this.line),
+      " ", // for who hears both
       this.#found,
     );
   }

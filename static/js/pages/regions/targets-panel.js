@@ -4,10 +4,9 @@ import { fill, h } from "../../lib/dom.js";
 import { icon } from "../../lib/icons.js";
 import { metres } from "../../lib/format.js";
 import { TARGET_NAME, isComplete } from "../../lib/targets.js";
-import { askText } from "../../components/dialog.js";
+import { askName } from "../../components/dialog.js";
 import { menuButton } from "../../components/menu.js";
 import { numberField } from "../../components/number-field.js";
-import { toast } from "../../components/toast.js";
 
 /** @typedef {import("../../lib/targets.js").Targets} Targets */
 /** @typedef {import("../../lib/targets.js").OpenTarget} OpenTarget */
@@ -135,20 +134,24 @@ function row(targets, target, isSelected) {
 
 /** @param {Targets} targets @param {string} name */
 async function rename(targets, name) {
-  const wanted = await askText({
+  const wanted = await askName({
     title: "Rename target",
     label: "Name",
     value: name,
     action: "Rename",
-    hint: "Letters, digits, - and _. It names the result file.",
+    hint: "Up to 64 letters, digits, - and _, a letter or digit first. It names the result file.",
+    refusal: (typed) => refusal(targets, name, typed),
   });
-  if (wanted === null || wanted === name) return;
+  if (wanted !== null && wanted !== name) targets.rename(name, wanted);
+}
+
+/** Why a target cannot be called so; null where it can. @param {Targets} targets @param {string} name as it is @param {string} wanted */
+function refusal(targets, name, wanted) {
+  if (!TARGET_NAME.test(wanted))
+    return `“${wanted}” cannot name a file: letters a to z, digits, - and _ only, a letter or digit first, at most 64.`;
   // On some systems one file would be both.
   const same = targets.all.find((other) => other.name !== name && other.name.toLowerCase() === wanted.toLowerCase());
-  if (!TARGET_NAME.test(wanted))
-    toast(`“${wanted}” cannot name a file: use letters, digits, - and _ only.`, { tone: "bad" });
-  else if (same?.name === wanted) toast(`There is already a target “${wanted}”.`, { tone: "bad" });
-  else if (same)
-    toast(`“${wanted}” and “${same.name}” would share a result file on some computers; choose another name.`, { tone: "bad" });
-  else targets.rename(name, wanted);
+  if (same === undefined) return null;
+  if (same.name === wanted) return `There is already a target “${wanted}”.`;
+  return `“${wanted}” and “${same.name}” would share a result file on some computers; choose another name.`;
 }
