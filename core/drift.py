@@ -287,7 +287,8 @@ def _pre_event_warnings(after: Floats, times: Floats, intervals: Intervals, corn
 
 def _frequency_warnings(before: Floats, times: Floats, intervals: Intervals, corner_hz: float) -> list[str]:
     """A corner at which the building itself moves, or above that."""
-    near, above = [], []
+    near: list[str] = []
+    above: list[str] = []
     for axis, name in enumerate(AXIS_NAMES):
         dominant_hz = dominant_frequency(before[:, axis], times, intervals)
         if dominant_hz is None or corner_hz <= 0.5 * dominant_hz:
