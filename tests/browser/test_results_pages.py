@@ -334,6 +334,22 @@ def wait_for_url(page: Page, pattern: str) -> str:
     return page.url
 
 
+def test_a_filter_is_named_and_space_plays_after_a_choice_was_clicked(browser, project):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    document["drift"] = {"filter": "high-pass", "corner_hz": 0.25}
+    (folder / "project.json").write_text(json.dumps(document))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/review")
+        expect(page.get_by_label("This frame", exact=True)).to_contain_text("σ before it", timeout=60_000)
+        page.get_by_role("radio", name="Frame", exact=True).click()
+        page.keyboard.press("Space")
+        expect(page.get_by_role("button", name="Pause")).to_be_visible()
+        page.goto(f"{pages}/track")
+        page.get_by_role("link", name="High-pass 0.25").click()
+        expect(page.get_by_role("heading", name="Drift", level=1)).to_be_visible()
+
+
 def test_frames_drawn_over_are_excluded_and_come_back_with_undo(browser, project):
     folder, pages = project
     with watched(browser, pages) as page:
