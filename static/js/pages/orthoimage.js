@@ -146,7 +146,11 @@ const whole = h(
   {
     class: "button small",
     type: "button",
-    onclick: () => void store.edit("Whole cloud as extent", (draft) => void (draft.orthoimage.extent_m = null)),
+    onclick: () => {
+      extent.forget();
+      if (store.project.orthoimage.extent_m !== null)
+        void store.edit("Whole cloud as extent", (draft) => void (draft.orthoimage.extent_m = null));
+    },
   },
   "Whole cloud",
 );
