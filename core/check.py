@@ -153,11 +153,11 @@ def obstacles(
         else:
             obstacle = scale_obstacle(target, camera, has_lens=project.inputs.lens is not None)
         if target.lines is not None and target.kind == "lines":
-            crossed_badly = list(_line_obstacles(target.lines, f"targets[{number}]"))
-            yield from crossed_badly
+            yield from _line_obstacles(target.lines, f"targets[{number}]")
             yield from _width_obstacles(target.lines, f"targets[{number}]", reference)
-            if obstacle is None and not crossed_badly:
-                obstacle = distance_obstacle(target, _apart_m(target.lines), camera)
+            apart_m = _apart_m(target.lines)
+            if obstacle is None and apart_m is not None:
+                obstacle = distance_obstacle(target, apart_m, camera)
         if obstacle is not None:
             yield f"targets[{number}].{obstacle}"
     if index is not None:
@@ -313,13 +313,28 @@ def _line_obstacles(lines: Lines, place: str) -> Iterator[str]:
         yield f"{place}.lines: L1 and L2 cross T1 in the same place; put them on two different roof lines"
 
 
-def _apart_m(lines: Lines) -> tuple[float, float]:
-    """Return the least and the most that P1 and P2 may lie apart within bands that cross well, plan metres."""
+def _apart_m(lines: Lines) -> tuple[float, float] | None:
+    """Return the least and the most that P1 and P2 may lie apart within the bands, plan metres.
+
+    None where a band ends before it crosses: it may lie beside its line, and the known distance be right.
+    """
     first, second = _crossing(lines.L1, lines.T1), _crossing(lines.L2, lines.T1)
-    assert first is not None
-    assert second is not None
+    if first is None or second is None:
+        return None
+    crossed = ((lines.L1, first), (lines.T1, first), (lines.L2, second), (lines.T1, second))
+    if not all(_reaches(band, place) for band, place in crossed):
+        return None
     apart_m, play_m = float(np.hypot(*(first - second))), (lines.L1.width_m + lines.L2.width_m) / 2
+    if apart_m < MIN_P1_P2_M:
+        return None
     return max(apart_m - play_m, 0.0), apart_m + play_m
+
+
+def _reaches(band: Band, place: Floats) -> bool:
+    """Whether a place (2,) on a band's axis, plan metres, lies between its ends."""
+    start = np.array(band.from_m)
+    along = np.array(band.to_m) - start
+    return bool(0 <= (place - start) @ along <= along @ along)
 
 
 def _width_obstacles(lines: Lines, place: str, reference: ReferenceFit | None) -> Iterator[str]:

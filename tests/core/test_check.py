@@ -120,10 +120,7 @@ def test_a_sound_project_has_no_problems(inputs: Path) -> None:
         (put(True, "reference_frame"), "reference_frame: input should be a valid integer, not true"),
         (put(3, "wind"), 'wind: unknown key "wind"'),
         (
-            lambda document: (
-                put({"from_m": [-2, 4], "to_m": [2, 4]}, "targets", 0, "lines", "L1")(document),
-                put(None, "targets", 0, "p1_p2_m")(document),
-            ),
+            put({"from_m": [-2, 4], "to_m": [2, 4]}, "targets", 0, "lines", "L1"),
             "targets.roof.lines.L1 ",
         ),
         (put([[[-9, -9], [170, -9], [170, 130], [-9, 130]]], "moving_regions_px"), "leave only 0 ground features"),
