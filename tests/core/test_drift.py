@@ -1,7 +1,8 @@
 from __future__ import annotations
 
 import re
-import time
+import timeit
+from collections.abc import Callable
 
 import numpy as np
 import pytest
