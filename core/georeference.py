@@ -265,6 +265,11 @@ def check_pairs(pairs: Sequence[Correspondence]) -> None:
         ("frame_px", np.array([pair.frame_px for pair in enabled])),
     ):
         if _collinear(points):
+            if (stray := _stray(points)) is not None:
+                raise InputError(
+                    f"project.json: correspondence {enabled[stray].id} lies so far from all others in {what} that they "
+                    "seem to lie in one place; correct it."
+                )
             raise InputError(
                 f"project.json: the correspondences are collinear in {what}, so the ground's tilt is unknown; "
                 "add pairs well away from their line."
@@ -284,6 +289,13 @@ def _number(count: int) -> str:
 def _collinear(points: Floats) -> bool:
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[1] <= COLLINEAR * spread[0])
+
+
+def _stray(points: Floats) -> int | None:
+    """Return which of collinear points is alone to blame, since the others spread as they should; None if none is."""
+    farthest = int(np.argmax(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+    others = np.delete(points, farthest, axis=0)
+    return farthest if len(others) >= 4 and not _collinear(others) else None
 
 
 def _all_but_one_collinear(points: Floats) -> bool:

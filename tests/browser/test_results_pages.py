@@ -313,7 +313,7 @@ def test_the_plot_and_the_player_lead_each_other(browser, finished):
         assert abs(shown - expected) <= 1
         at_rest(page, shown)
         expect(page.locator(".facts-table tbody tr").first).to_contain_text(
-            f"{1000 * history['p1_dx_m'][shown]:.1f}".replace("-", "−")
+            f"{1000 * history['p1_dx_m'][shown]:.2f}".replace("-", "−")
         )
 
 

@@ -234,6 +234,13 @@ def test_too_little_is_refused_with_a_remedy(pairs: list[Correspondence], words:
     assert "project.json" in str(refusal.value)
 
 
+def test_a_mistyped_coordinate_is_named_and_not_called_a_line() -> None:
+    pairs = clicks()
+    pairs[3] = pairs[3].model_copy(update={"ground_m": (1e8, pairs[3].ground_m[1])})
+    with pytest.raises(InputError, match=f"correspondence {pairs[3].id} lies so far from all others in ground_m"):
+        fit_reference(pairs, LENS)
+
+
 def test_clicks_all_on_one_line_of_the_frame() -> None:
     pairs = [pair.model_copy(update={"frame_px": (100.0 * pair.id, 500.0)}) for pair in clicks()]
     with pytest.raises(InputError, match="collinear in frame_px"):
