@@ -38,7 +38,9 @@ def solve(
     """
     repeated = repeated_pictures(recording)
     # What a person has rejected must not tell how the building rests, how the camera flies or what the lens is like.
-    recording = without_pictures(recording, repeated | excluded_by(project, recording))
+    passed_over = repeated | excluded_by(project, recording)
+    if passed_over.any():
+        recording = without_pictures(recording, passed_over)
     if project.method == "paper":
         solution = solve_paper(recording, project, lens, relief, has_lens=has_lens)
     else:
