@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Page, Route, sync_playwright
 
 from core.run import run_project
 
@@ -133,6 +133,31 @@ def eventually(holds: Callable[[], bool], seconds: float = 20.0) -> None:
     while not holds():
         assert time.monotonic() < end, "it did not come about in time"
         time.sleep(0.1)
+
+
+def answer_first(page: Page, address: str, answer: Callable[[Route], Any]) -> None:
+    """Answer the first request for an address oneself; those after it go their way.
+
+    The route stays to the end of the page: were it taken off, the browser would end its interception, and a request
+    that is under way just then is never answered.
+    """
+    seen: list[Route] = []
+
+    def answer_or_pass(route: Route) -> None:
+        if seen:
+            route.continue_()
+        else:
+            seen.append(route)
+            answer(route)
+
+    page.route(address, answer_or_pass)
+
+
+def hold_first(page: Page, address: str) -> list[Route]:
+    """Hold the first request for an address; it will be in the list that is returned (see `arrived`)."""
+    held: list[Route] = []
+    answer_first(page, address, held.append)
+    return held
 
 
 def arrived(page: Page, held: list[Any]) -> Any:

@@ -15,7 +15,17 @@ from core.drift import high_pass
 from core.project import read_project
 from core.results import read_history_csv
 from core.run import run_project
-from tests.browser.live import arrived, ask, edit_elsewhere, eventually, free_port, serving, watched
+from tests.browser.live import (
+    answer_first,
+    arrived,
+    ask,
+    edit_elsewhere,
+    eventually,
+    free_port,
+    hold_first,
+    serving,
+    watched,
+)
 from tests.browser.steps import FRAME_SIZE
 
 FRAMES = 600
@@ -48,13 +58,19 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
         expect(page.locator("[data-step=track]")).to_have_attribute("data-status", "running")
         expect(page.locator(".toast")).to_have_count(0)
         held: list[Route] = []
-        page.route("**/track", lambda route: held.append(route) if route.request.method == "GET" else route.continue_())
+        released: list[bool] = []
+        page.route(
+            "**/track",
+            lambda route: route.continue_() if released or route.request.method != "GET" else held.append(route),
+        )
         page.get_by_role("button", name="Cancel").click()
         expect(page.get_by_text("Reading what was kept…")).to_be_visible()
         expect(page.get_by_role("button", name="Start")).to_have_count(0)
         page.keyboard.press("r")  # what would be started is not known yet
-        arrived(page, held).continue_()
-        page.unroute("**/track")
+        arrived(page, held)
+        released.append(True)
+        for route in held:
+            route.continue_()
         expect(page.locator("[data-step=track]")).to_have_attribute("data-status", "warn")
         expect(page.get_by_role("button", name="Resume")).to_be_visible()
     with serving(tmp_path, port) as address, watched(browser, address) as page:
@@ -162,7 +178,7 @@ def test_what_cannot_be_asked_is_told_and_asked_again_and_no_older_overlay_stays
 
     with watched(browser, pages) as page:
         page.route("**/results", trouble_at_first)
-        page.route("**/inputs", lambda route: route.abort(), times=1)
+        answer_first(page, "**/inputs", lambda route: route.abort())
         page.route("**/review/30?*", hold_the_first)
         page.goto(f"{pages}/review?frame=30")
         expect(page.get_by_role("heading", name="The results cannot be shown")).to_be_visible()
@@ -404,12 +420,11 @@ def test_the_corner_slider_shows_what_the_engine_filters(browser, project):
 
 def test_nothing_of_another_corner_stands_beside_the_new_one(browser, project):
     _, pages = project
-    held: list[Route] = []
     with watched(browser, pages) as page:
         page.goto(f"{pages}/drift")
         expect(page.locator(".warnings")).not_to_be_empty()
         expect(page.locator(".drift-lower .plot-playhead").first).to_be_visible()
-        page.route("**/drift", lambda route: route.continue_() if held else held.append(route))
+        held = hold_first(page, "**/drift")
         line = page.locator(".drift-lower .plot-playhead").first
         before = line.bounding_box()["x"]
         page.get_by_role("slider", name="Corner frequency").focus()
@@ -418,9 +433,7 @@ def test_nothing_of_another_corner_stands_beside_the_new_one(browser, project):
         expect(page.locator(".warnings")).to_have_class(re.compile("awaited"))
         expect(page.get_by_role("status").filter(has_text="Solving…")).to_be_visible()
         assert line.bounding_box()["x"] > before
-        for route in held[:]:
-            route.continue_()
-        page.unroute("**/drift")
+        arrived(page, held).continue_()
         expect(page.locator(".figures")).not_to_have_class(re.compile("awaited"))
         expect(page.get_by_role("status").filter(has_text="Solving…")).to_be_hidden()
 
