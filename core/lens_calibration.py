@@ -19,7 +19,7 @@ from core.coordinates import Floats, read_only
 from core.errors import InputError
 from core.lens import Lens, LensSigma, read_lens
 from core.progress import CancelToken, Progress, silent
-from core.video import frame_index, read_frames
+from core.video import frame_index, probe, read_frames
 
 Luma = NDArray[np.uint8]
 
@@ -264,6 +264,7 @@ def _read_image(path: Path) -> Luma:
 
 def _sharpest_frames(path: Path) -> Iterator[tuple[str, Luma]]:
     """Yield the sharpest of a few neighbouring frames from each of equal parts of a video."""
+    probe(path)  # a mirrored picture would be another lens
     index = frame_index(path)
     total = len(index)
     for part in range(min(_VIDEO_PARTS, max(1, total // _FRAMES_PER_PART))):

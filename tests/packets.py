@@ -1,4 +1,4 @@
-"""Videos whose packets have been tampered with."""
+"""Videos whose packets or display matrix have been tampered with."""
 
 from __future__ import annotations
 
@@ -22,3 +22,16 @@ def repacked(source: Path, target: Path, edit: Callable[[int, bytes], bytes | No
             changed.duration, changed.is_keyframe, changed.stream = packet.duration, packet.is_keyframe, copy
             made.mux(changed)
     return target
+
+
+def shown_by(file: Path, matrix: tuple[float, float, float, float]) -> None:
+    """Set the four numbers of an MP4 file's display matrix that turn, stretch and mirror."""
+    one = 1 << 16
+    a, b, c, d = (round(one * number) for number in matrix)
+    as_filmed, shown = (
+        b"".join(value.to_bytes(4, "big", signed=True) for value in numbers)
+        for numbers in ((one, 0, 0, 0, one, 0, 0, 0, 1 << 30), (a, b, 0, c, d, 0, 0, 0, 1 << 30))
+    )
+    content = file.read_bytes()
+    at = content.index(as_filmed, content.index(b"tkhd"))
+    file.write_bytes(content[:at] + shown + content[at + len(shown) :])

@@ -12,6 +12,7 @@ from core.errors import Cancelled, InputError
 from core.lens import Lens, read_lens, write_lens
 from core.lens_calibration import calibrate, calibrate_images, images_of
 from core.progress import CancelToken
+from tests.packets import shown_by
 
 BOARD, SQUARE_M = (9, 6), 0.025
 TRUE = Lens((720, 480), [[615.0, 0, 354.0], [0, 611.0, 244.0], [0, 0, 1]], [-0.18, 0.06, 8e-4, -5e-4, 0.0])
@@ -185,3 +186,6 @@ def test_a_video_gives_its_sharp_frames(tmp_path):
     found = calibrate([file], board=BOARD, square_m=SQUARE_M)
     assert [view.name for view in found.views] == [f"board.mp4 frame {5 * i + 2}" for i in range(6)]
     assert found.lens.focal_px == pytest.approx(TRUE.focal_px, rel=0.01)
+    shown_by(file, (-1, 0, 0, 1))
+    with pytest.raises(InputError, match=r"board\.mp4: says that it is to be shown mirrored"):
+        calibrate([file], board=BOARD, square_m=SQUARE_M)

@@ -15,7 +15,7 @@ from av.video.frame import PictureType
 
 from core.errors import InputError
 from core.video import FramesAhead, Luma, frame_index, luma_of, probe, read_frame, read_frames, video_warnings
-from tests.packets import repacked
+from tests.packets import repacked, shown_by
 
 SIZE = (96, 64)
 FRAMES = 50
@@ -68,20 +68,7 @@ def write(
 def _turned(file: Path, rotation: int) -> None:
     """Set the display matrix of an MP4 file: the turn, clockwise, that a player must make."""
     cosine, sine = {90: (0, 1), 180: (-1, 0), 270: (0, -1)}[rotation]
-    _shown_by(file, (cosine, sine, -sine, cosine))
-
-
-def _shown_by(file: Path, matrix: tuple[float, float, float, float]) -> None:
-    """Set the four numbers of an MP4 file's display matrix that turn, stretch and mirror."""
-    one = 1 << 16
-    a, b, c, d = (round(one * number) for number in matrix)
-    as_filmed, shown = (
-        b"".join(value.to_bytes(4, "big", signed=True) for value in numbers)
-        for numbers in ((one, 0, 0, 0, one, 0, 0, 0, 1 << 30), (a, b, 0, c, d, 0, 0, 0, 1 << 30))
-    )
-    content = file.read_bytes()
-    at = content.index(as_filmed, content.index(b"tkhd"))
-    file.write_bytes(content[:at] + shown + content[at + len(shown) :])
+    shown_by(file, (cosine, sine, -sine, cosine))
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +178,7 @@ def test_what_is_not_to_be_shown_in_quarter_turns_is_refused(
     tmp_path: Path, matrix: tuple[float, float, float, float], how: str
 ) -> None:
     file = write(tmp_path / "shown.mp4", frames=3)
-    _shown_by(file, matrix)
+    shown_by(file, matrix)
     with pytest.raises(InputError, match=f"shown.mp4: says that it is to be shown {how}"):
         probe(file)
 
