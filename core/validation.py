@@ -178,12 +178,7 @@ class GpsComparison:
 
 
 def compare_with_gps(
-    time_s: ArrayLike,
-    displacement_m: ArrayLike,
-    gps: GpsRecord,
-    intervals: Intervals,
-    *,
-    max_lag_s: float | None = None,
+    time_s: ArrayLike, displacement_m: ArrayLike, gps: GpsRecord, intervals: Intervals
 ) -> GpsComparison:
     """Return how the video's displacement compares with GPS, after setting the GPS clock.
 
@@ -197,7 +192,6 @@ def compare_with_gps(
         displacement_m: (F, 2) at the antenna, from rest, NaN where not measured.
         gps: the record.
         intervals: of the project, in video time.
-        max_lag_s: largest difference of the clocks to consider; any where None.
 
     Raises:
         InputError: the video has no measured frames, the two records share no time, or GPS is not in metres.
@@ -205,7 +199,7 @@ def compare_with_gps(
     times = np.asarray(time_s, dtype=np.float64)
     moved = np.asarray(displacement_m, dtype=np.float64)
     video = _Video.of(times, moved)
-    lag = _lag(video, gps, max_lag_s)
+    lag = _lag(video, gps)
     lag_s = lag.lag_s
     shared = within(gps.time_s + lag_s, (float(video.times[0]), float(video.times[-1])))
     sample_s, sample_m = gps.time_s[shared] + lag_s, gps.position_m[shared]
@@ -299,11 +293,8 @@ class _Lag:
         return ""
 
 
-def _lag(video: _Video, gps: GpsRecord, max_lag_s: float | None) -> _Lag:
+def _lag(video: _Video, gps: GpsRecord) -> _Lag:
     lags_s, correlations = _correlations(video, gps)
-    if max_lag_s is not None:
-        considered = np.abs(lags_s) <= max_lag_s
-        lags_s, correlations = lags_s[considered], correlations[considered]
     best = float(correlations.max(initial=-1.0))
     if best < _LEAST_CORRELATION:
         return _Lag(0.0, None, best)

@@ -220,9 +220,3 @@ def test_refuses_records_that_share_no_time_or_nothing_measured() -> None:
         compare_with_gps(time_s, rng.normal(scale=3e-4, size=(900, 2)), record, INTERVALS)
     with pytest.raises(InputError, match="measured in 0 frames; a comparison with GPS needs at least four"):
         compare_with_gps(time_s, np.full((900, 2), np.nan), record, INTERVALS)
-
-
-def test_largest_lag_is_respected() -> None:
-    time_s, moved = video()
-    comparison = compare_with_gps(time_s, moved, gps_with_lag(9.0), INTERVALS, max_lag_s=2.0)
-    assert abs(comparison.lag_s) <= 2.0
