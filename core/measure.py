@@ -228,28 +228,55 @@ def measure(
     recording = None if fresh else store.find(setup.method, setup.fingerprint)
     if recording is not None and store.is_finished(recording):
         return recording
-    index = frame_index(setup.video)
-    done = [] if recording is None else store.measured_frames(recording)
+    remainder = _Remainder(setup, store, frame_index(setup.video), recording)
     with ExitStack() as stack:
-        # While the reference frame is still looked at, others load and the first chunk is being decoded.
-        cluster = stack.enter_context(Cluster(measure_remotely, scheduler)) if scheduler is not None else None
-        cores = available_cores()
-        processes = processes_for(len(index) - len(done), workers, cores, pixels=math.prod(setup.lens.image_size_px))
-        chunks = missing_chunks(done, index, processes, HEAD_START) if cluster is None else []
-        before = [_before(store, recording, chunk.start) for chunk in chunks]
+        source = remainder.here(stack, workers) if scheduler is None else remainder.remotely(stack, scheduler)
+        recording = remainder.begun
+        done, total = len(remainder.done), len(remainder.index)
+        _take_over(source, store, recording, done=done, total=total, progress=progress, cancel=cancel)
+    store.finish(recording)
+    return recording
+
+
+class _Remainder:
+    """What of a video is still to be measured.
+
+    While the reference frame is looked at, helpers or the cluster load and the first chunk is being decoded.
+
+    Args:
+        recording: of what is measured already, None where nothing is.
+
+    Attributes:
+        done: frames that are measured already.
+    """
+
+    def __init__(self, setup: MeasureSetup, store: MeasurementStore, index: FrameIndex, recording: int | None) -> None:
+        self._setup = setup
+        self._store = store
+        self._recording = recording
+        self.index = index
+        self.done = [] if recording is None else store.measured_frames(recording)
+
+    @property
+    def begun(self) -> int:
+        """The recording that measurements go into, known once its reference frame has been looked at."""
+        assert self._recording is not None
+        return self._recording
+
+    def here(self, stack: ExitStack, workers: int | None) -> Generator[FrameMeasurement, None, None]:
+        """Return what this process and its helpers will measure; they are gone when the stack closes."""
+        setup, cores = self._setup, available_cores()
+        left, pixels = len(self.index) - len(self.done), math.prod(setup.lens.image_size_px)
+        processes = processes_for(left, workers, cores, pixels=pixels)
+        chunks = missing_chunks(self.done, self.index, processes, HEAD_START)
         helping = max(0, min(processes, len(chunks)) - 1)
         helpers = stack.enter_context(Helpers(measure_order, helping))
         threads = max(1, cores // (1 + helping)) if helping else 0
         decoding = None
-        if recording is None and cluster is None:
-            decoding = stack.enter_context(FramesAhead(setup.video, threads=threads, index=index))
-        reference = None if recording is None else store.reference(recording)
-        measurer = make_measurer(setup, reference, index, decoding)
-        if cluster is not None:
-            cluster.require()
-        if recording is None:
-            recording = store.begin(setup.method, setup.fingerprint, measurer.reference)
-        prepared = pickle.dumps(PreparedVideo(setup, index, measurer))
+        if self._recording is None:
+            decoding = stack.enter_context(FramesAhead(setup.video, threads=threads, index=self.index))
+        before = [_before(self._store, self._recording, chunk.start) for chunk in chunks]
+        measurer = self._measurer(decoding)
 
         def own(order: Order) -> Iterator[FrameMeasurement]:
             return measure_chunk(
@@ -258,18 +285,33 @@ def measure(
                 measurer=measurer,
                 before=order.before,
                 threads=order.threads,
-                index=index,
+                index=self.index,
                 decoding=decoding if order.chunk == chunks[0] else None,
             )
 
-        if cluster is None:
-            orders = [Order(prepared, chunk, known, threads) for chunk, known in zip(chunks, before, strict=True)]
-            source = helpers.measure(orders, own)
-        else:
-            source = cluster.measure(prepared, lambda parts: missing_chunks(done, index, parts), len(index))
-        _take_over(source, store, recording, done=len(done), total=len(index), progress=progress, cancel=cancel)
-    store.finish(recording)
-    return recording
+        prepared = self._begin(measurer)
+        orders = [Order(prepared, chunk, known, threads) for chunk, known in zip(chunks, before, strict=True)]
+        return helpers.measure(orders, own)
+
+    def remotely(self, stack: ExitStack, scheduler: str) -> Generator[FrameMeasurement, None, None]:
+        """Return what the workers of a Dask scheduler will measure; they are left when the stack closes."""
+        cluster = stack.enter_context(Cluster(measure_remotely, scheduler))
+        measurer = self._measurer()
+        cluster.require()
+        prepared = self._begin(measurer)
+        return cluster.measure(
+            prepared, lambda parts: missing_chunks(self.done, self.index, parts), frames=len(self.index)
+        )
+
+    def _measurer(self, decoding: FramesAhead | None = None) -> Measurer:
+        reference = None if self._recording is None else self._store.reference(self._recording)
+        return make_measurer(self._setup, reference, self.index, decoding)
+
+    def _begin(self, measurer: Measurer) -> bytes:
+        """Begin a recording where there is none, and pack what helpers and workers need."""
+        if self._recording is None:
+            self._recording = self._store.begin(self._setup.method, self._setup.fingerprint, measurer.reference)
+        return pickle.dumps(PreparedVideo(self._setup, self.index, measurer))
 
 
 def _take_over(
