@@ -890,14 +890,55 @@ def test_projects_are_copied_renamed_archived_restored_and_deleted_with_undo(bro
         assert not folder.exists()
         page.get_by_role("button", name="Undo", exact=True).click()
         expect(card).to_have_count(1)
+        expect(page.get_by_role("button", name="Deleted projects")).to_have_count(0)
+        act(page, card, "Delete")
+        page.reload()  # and nothing is left to undo it
+        page.get_by_role("button", name="Deleted projects (1)").click()
+        expect(page.get_by_role("dialog")).to_contain_text(f"in folder {folder.name} · deleted just now · kept until")
+        page.get_by_role("button", name="Restore Sample by hand").click()
+        expect(page.locator(".toast")).to_contain_text("Sample by hand was restored.")
+        expect(card).to_have_count(1)
+        expect(page.get_by_role("button", name="Deleted projects")).to_have_count(0)
         before = page.locator("[data-project]").count()
         with page.expect_file_chooser() as chooser:
             page.get_by_role("button", name="Restore archive…").click()
         chooser.value.set_files(archive)
         expect(page.locator("[data-project]")).to_have_count(before + 1)
-        page.locator(".toast").get_by_role("button", name="Open").click()
+        page.locator(".toast").get_by_role("button", name="Open").last.click()
         expect(page.locator(".project-name")).to_have_text("Sample by hand")
     assert read_project(folder).name == "Sample by hand"
+
+
+def test_deleted_projects_that_cannot_be_asked_for_are_asked_for_again(browser, project):
+    folder, pages = project
+    address = pages.split("/p/")[0]
+    with watched(browser, address) as page:
+        page.goto(address)
+        act(page, page.locator(f"[data-project='{folder.name}']"), "Delete")
+        deleted = page.get_by_role("button", name=re.compile(r"Deleted projects \(\d+\)"))
+        expect(deleted).to_be_visible()
+        answer_first(page, "**/api/trash", lambda route: route.abort())
+        deleted.click()
+        expect(page.get_by_role("alert")).to_contain_text("does not answer")
+        page.get_by_role("button", name="Try again").click()
+        row = page.get_by_role("dialog").locator(f"[data-project='{folder.name}']")
+        expect(row).to_be_visible()
+        page.request.post(
+            f"{address}/api/projects/untrash",
+            data={"undo_token": token_of(page, address, folder.name)},
+            headers={"X-Rooftrack": "1", "Origin": address},
+        )  # by another window
+        row.get_by_role("button", name="Restore").click()
+        expect(page.get_by_role("alert")).to_contain_text("The trash no longer holds this project.")
+        expect(page.locator(f"[data-project='{folder.name}']")).to_have_count(1)
+
+
+def token_of(page: Page, address: str, name: str) -> str:
+    """Return what fetches a deleted project back."""
+    (token,) = [
+        deleted["undo_token"] for deleted in page.request.get(f"{address}/api/trash").json() if deleted["id"] == name
+    ]
+    return token
 
 
 def act(page: Page, card, item: str, name: str | None = None) -> None:
