@@ -706,6 +706,11 @@ def test_a_file_is_chosen_by_typing_its_path(browser, project):
         path.fill(str(folder / "none.yaml"))
         path.press("Enter")
         expect(page.get_by_role("dialog")).to_contain_text("no such file")
+        (folder / "wrong.yaml").write_text("not a lens")
+        path.fill(str(folder / "wrong.yaml"))
+        path.press("Enter")
+        expect(lens.locator(".refusal")).to_contain_text("wrong.yaml")
+        lens.get_by_role("button", name="Choose on this computer").click()
         path.fill(str(folder))
         path.press("Enter")
         expect(page.get_by_role("option", name="again.yaml")).to_be_visible()
@@ -714,6 +719,7 @@ def test_a_file_is_chosen_by_typing_its_path(browser, project):
         expect(page.get_by_role("dialog")).to_have_count(0)
         saved(page)
         eventually(lambda: read_project(folder).inputs.lens == "again.yaml")
+        expect(lens.locator(".refusal")).to_be_empty()
 
 
 def test_what_is_missing_is_named_with_the_way_to_it(browser, project, server):
@@ -770,7 +776,10 @@ def test_inputs_are_sent_taken_back_and_calibrated(browser, project, tmp_path):
         wrong.write_text("not a lens")
         chooser.value.set_files(wrong)
         expect(page.get_by_role("alert")).to_contain_text("wrong.yaml")
+        expect(lens.locator(".refusal")).to_contain_text("wrong.yaml")
         expect(lens.locator(".badge")).to_have_text("understood")  # the lens before stays
+        lens.get_by_role("button", name="Dismiss").click()
+        expect(lens.locator(".refusal")).to_be_empty()
         assert read_project(folder).inputs.lens == "lens.yaml"
 
         lens.get_by_role("button", name="Calibrate…").click()
