@@ -203,12 +203,16 @@ def test_edits_wait_in_the_window_for_a_server_that_does_not_answer(browser, pro
         expect(page.locator(".save-state")).to_have_text("Not saved yet")
         for pair in (4, 5):
             expect(page.get_by_role("checkbox", name=f"Pair {pair} counts")).not_to_be_checked()
+        figures = page.locator("#fit .figures")
+        expect(figures).to_contain_class("awaited")  # they are of the pairs before
+        expect(figures).to_contain_text("18 / 20")
         to_step(page, "Regions")
         assert arrived(page, asked) == "beforeunload"
         page.context.set_offline(False)
         saved(page)
         expect(page.get_by_text("The server does not answer – trying again")).to_be_hidden()
-        expect(page.locator("#fit .figures")).to_contain_text("18 / 20")
+        expect(figures).not_to_contain_class("awaited")
+        expect(figures).to_contain_text("18 / 20")
     assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [4, 5]
 
 

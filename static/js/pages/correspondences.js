@@ -9,6 +9,7 @@ import { latest } from "../lib/latest.js";
 import { setView, viewNumber, viewText } from "../lib/view-state.js";
 import { PaneImage } from "../components/pane-image.js";
 import { activePane, nudgeKeys, paneKeys } from "../components/pane-keys.js";
+import { FAINT_AFTER_MS, delayedSign } from "../components/delayed-sign.js";
 import { menuButton } from "../components/menu.js";
 import { numberField } from "../components/number-field.js";
 import { openPage } from "../components/page.js";
@@ -91,10 +92,25 @@ const askFit = latest(
   (/** @type {Correspondence[]} */ correspondences) => post(projectPath(page.id, "fit"), { correspondences }),
   (/** @type {Fit} */ answer) => {
     fit = answer;
+    fitAwaited.end();
     showFit();
   },
   toastError,
 );
+
+/** Whether the numbers shown are of earlier pairs: the server takes its time, or does not answer. */
+let isEarlier = false;
+const fitAwaited = delayedSign(FAINT_AFTER_MS, (on) => {
+  isEarlier = on;
+  showNumbers();
+});
+
+/** @param {Correspondence[]} correspondences */
+function fitAnew(correspondences) {
+  fitAwaited.begin();
+  if (isEarlier) showNumbers();
+  void askFit(correspondences);
+}
 
 /** Counterparts of waiting halves, where the saved pairs already tie the views together. */
 async function findGhosts() {
@@ -116,10 +132,15 @@ const showFitFigures = fitPanel(find("#fit"));
 const table = pairsTable(find("#pairs"), { onSelect: goTo, onToggle: (id) => slots.toggle(id) });
 const selection = selectionPanel(find("#selection"), slots, { goTo });
 
-function showFit() {
+function showNumbers() {
   const pairs = store.project.correspondences;
-  showFitFigures(fit, pairs.filter((pair) => pair.enabled).length, pairs.length);
-  table.show(pairs, fit);
+  const enabled = pairs.filter((pair) => pair.enabled).length;
+  showFitFigures(fit, { enabled, total: pairs.length, awaited: isEarlier });
+  table.show(pairs, fit, isEarlier);
+}
+
+function showFit() {
+  showNumbers();
   frame.residuals = residuals((pair, predicted) => subtract(predicted.predicted_px, pair.frame_px));
   ortho.residuals = residuals(({ ground_m }, { predicted_m }) =>
     grid === null ? null : subtract(orthoFromWorld(grid, predicted_m), orthoFromWorld(grid, ground_m)),
@@ -177,7 +198,7 @@ for (const side of sides) {
     if (linked && fit.state === "ok") follow(side);
   });
   side.on("moving", ({ id, side: which, point }) => {
-    askFit(store.project.correspondences.map((pair) => (pair.id === id ? { ...pair, [which]: point } : pair)));
+    fitAnew(store.project.correspondences.map((pair) => (pair.id === id ? { ...pair, [which]: point } : pair)));
   });
 }
 
@@ -460,7 +481,7 @@ store.on("change", ({ project, previous, origin }) => {
   if (project.reference_frame !== previous.reference_frame) referenceFrame.set(project.reference_frame);
   if (shownOf(project) !== shownOf(previous)) void loadFrame();
   if (origin === "edit" || JSON.stringify(project.correspondences) !== JSON.stringify(previous.correspondences))
-    askFit(project.correspondences);
+    fitAnew(project.correspondences);
   if (origin === "saved") {
     compare.refresh();
     void findGhosts();
@@ -471,7 +492,7 @@ store.on("change", ({ project, previous, origin }) => {
 page.events.on("orthoimage", () => void loadOrtho());
 page.events.on("inputs", ({ kind }) => ["video", "lens"].includes(kind) && void loadFrame());
 
-askFit(store.project.correspondences);
+fitAnew(store.project.correspondences);
 await Promise.all([loadFrame(), loadOrtho()]);
 sides.forEach((side) => side.restoreView());
 showSelection();
