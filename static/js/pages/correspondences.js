@@ -1,6 +1,6 @@
 // Step 3: pairs of places in the reference frame and on the orthoimage. Two panes, no modes.
 
-import { ApiError, get, post, projectPath } from "../lib/api.js";
+import { get, post, projectPath } from "../lib/api.js";
 import { orthoFromWorld, subtract, worldFromOrtho } from "../lib/coordinates.js";
 import { find, h } from "../lib/dom.js";
 import { downloadText, pickFiles } from "../lib/download.js";
@@ -112,18 +112,22 @@ function fitAnew(correspondences) {
   void askFit(correspondences);
 }
 
-/** Counterparts of waiting halves, where the saved pairs already tie the views together. */
-async function findGhosts() {
-  for (const side of sides) {
-    const halves = fit.state === "ok" ? halvesWithout(slots, side.side) : [];
-    const placed = halves.map((half) => /** @type {Point} */ (half[otherSide(side.side)]));
-    try {
-      side.setGhosts(halves, await transform(side === frame ? "plan" : "raw", side.frameName, placed));
-    } catch (error) {
-      if (!(error instanceof ApiError)) throw error;
-      side.setGhosts([], []);
-    }
-  }
+/** Asks for the counterparts of waiting halves on a side. @param {PairPane} side */
+const ghostsOf = (side) =>
+  latest(
+    async () => {
+      // Where the saved pairs already tie the views together.
+      const halves = fit.state === "ok" ? halvesWithout(slots, side.side) : [];
+      const placed = halves.map((half) => /** @type {Point} */ (half[otherSide(side.side)]));
+      return { halves, places: await transform(side === frame ? "plan" : "raw", side.frameName, placed) };
+    },
+    ({ halves, places }) => side.setGhosts(halves, places),
+    () => side.setGhosts([], []), // no fit, no ghost: the fit panel says why
+  );
+const askGhosts = sides.map(ghostsOf);
+
+function findGhosts() {
+  for (const ask of askGhosts) void ask(null);
 }
 
 // --- side panel
@@ -148,7 +152,7 @@ function showFit() {
   // as long for as many metres as in the frame
   if (grid !== null && fit.rms_px && fit.rms_m) ortho.arrowPx = (ARROW_PX * grid.pixel_size_m * fit.rms_px) / fit.rms_m;
   sides.forEach((side) => side.draw());
-  void findGhosts();
+  findGhosts();
 }
 
 /**
@@ -350,7 +354,7 @@ function showFrame(image, { number, und }) {
   frame.chrome.setTitle(`Frame ${number} · ${und ? "undistorted" : "raw"}`);
   frame.chrome.setNote();
   frame.refresh();
-  void findGhosts();
+  findGhosts();
 }
 
 function loadOrtho() {
@@ -474,7 +478,7 @@ page.keys([
 slots.on("change", () => {
   sides.forEach((side) => side.refresh());
   showSelection();
-  void findGhosts();
+  findGhosts();
 });
 store.on("change", ({ project, previous, origin }) => {
   sides.forEach((side) => side.refresh());
@@ -484,7 +488,7 @@ store.on("change", ({ project, previous, origin }) => {
     fitAnew(project.correspondences);
   if (origin === "saved") {
     compare.refresh();
-    void findGhosts();
+    findGhosts();
   }
   if (project.correspondences.length > previous.correspondences.length)
     announce(`${plural(project.correspondences.length, "pair")} placed`);
