@@ -20,7 +20,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 from starlette.types import Scope
 
-from app.api import drift, events, frames, geometry, inputs, orthoimage, projects, results, scene, viser
+from app.api import drift, events, frames, geometry, inputs, orthoimage, projects, results, scene, trash, viser
 from app.context import Context, Here
 from app.errors import ApiError, Missing, install_error_handlers
 from app.events import Hub
@@ -73,7 +73,7 @@ def create_app(workspace: Path, roots: Sequence[Path] = ()) -> FastAPI:
     app = FastAPI(title="Rooftrack", lifespan=_life, docs_url=None, redoc_url=None, openapi_url=None)
     app.state.context = context
     install_error_handlers(app)
-    for part in (projects, events, inputs, frames, orthoimage, geometry, results, drift, scene, viser):
+    for part in (projects, trash, events, inputs, frames, orthoimage, geometry, results, drift, scene, viser):
         app.include_router(part.router)
     _add_pages(app)
     app.add_middleware(Guard)

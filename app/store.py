@@ -54,6 +54,22 @@ _TRASH_KEPT_S = 31 * 86_400.0
 
 
 @dataclass(frozen=True)
+class Deleted:
+    """A project in the trash.
+
+    Attributes:
+        undo_token: what fetches it back.
+        deleted_s, kept_until_s: seconds since the epoch.
+    """
+
+    undo_token: str
+    id: str
+    name: str
+    deleted_s: float
+    kept_until_s: float
+
+
+@dataclass(frozen=True)
 class Saved:
     """A project as it lies on the disk, and where it stands in its history."""
 
@@ -425,6 +441,19 @@ class Workspace:
         os.rename(found[0], target)
         place.rmdir()
         return self.open(target.name)
+
+    def deleted(self) -> list[Deleted]:
+        """Return the projects in the trash, the last thrown away first."""
+        found = [self._deleted(folder) for folder in (self.folder / TRASH_FOLDER).glob("*/*") if _is_project(folder)]
+        return sorted(found, key=lambda project: -project.deleted_s)
+
+    def _deleted(self, folder: Path) -> Deleted:
+        try:
+            name = read_project(self.places.allowed(folder)).name
+        except (InputError, ApiError):
+            name = folder.name
+        deleted_s = folder.parent.stat().st_mtime
+        return Deleted(folder.parent.name, folder.name, name, deleted_s, deleted_s + _TRASH_KEPT_S)
 
     def empty_trash(self) -> None:
         """Remove what was thrown away more than a month ago."""

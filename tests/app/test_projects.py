@@ -321,6 +321,21 @@ def test_the_trash_gives_back_what_it_took(client: TestClient, workspace: Path) 
     assert client.post("/api/projects/untrash", json={"undo_token": "../../etc"}).status_code == 404
 
 
+def test_the_trash_tells_what_it_holds_and_until_when(client: TestClient, workspace: Path) -> None:
+    assert client.get("/api/trash").json() == []
+    small, other = (client.delete(f"/api/projects/{name}").json()["undo_token"] for name in _two_projects(client))
+    hour_ago_s = time.time() - 3600
+    os.utime(workspace / ".trash" / small, (hour_ago_s, hour_ago_s))
+    (workspace / ".trash" / other / "other" / "project.json").write_text("{")
+    last, first = client.get("/api/trash").json()
+    assert (last["undo_token"], last["id"], last["name"]) == (other, "other", "other")
+    assert (first["undo_token"], first["id"], first["name"]) == (small, "small", "small")
+    assert first["deleted_s"] == pytest.approx(hour_ago_s, abs=1)
+    assert first["kept_until_s"] == pytest.approx(hour_ago_s + 31 * 86_400, abs=1)
+    client.post("/api/projects/untrash", json={"undo_token": small})
+    assert [project["id"] for project in client.get("/api/trash").json()] == ["other"]
+
+
 def test_a_broken_project_file_is_listed_with_its_problem(client: TestClient, workspace: Path) -> None:
     (workspace / "small" / "project.json").write_text("{")
     (project,) = client.get("/api/projects").json()

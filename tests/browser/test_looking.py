@@ -14,8 +14,8 @@ from playwright.sync_api import Locator, Page, expect
 
 from app.scene3d import line_colours
 from tests.browser.hands import Placement, centre_of, drawn, finger, fitted, pinch, zoomed
-from tests.browser.live import ask, ask_bytes, eventually, free_port, serving, watched
-from tests.browser.steps import FRAME_SIZE, pane, pixels, ready, saved
+from tests.browser.live import arrived, ask, ask_bytes, eventually, free_port, hold_first, serving, watched
+from tests.browser.steps import FRAME_SIZE, NO_DOUBLE_CLICK_MS, pane, pixels, ready, saved
 
 # What each page shows last.
 SHOWN_LAST = {
@@ -31,6 +31,8 @@ SHOWN_LAST = {
 # Levels by which a line's colour in the scene may differ from the one it was given: its edges are smoothed.
 ALIKE_LEVELS = 40
 FAR_PX = 40
+# Half of a red picture, blended over the whole orthoimage, would be seen by far more.
+RED_LEVELS = 20
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +103,46 @@ def compare(page: Page, name: str) -> None:
     """Choose how the two pictures are compared."""
     group = page.get_by_role("group", name="Compare with the orthorectified frame")
     group.get_by_role("button", name=name, exact=True).click()
+
+
+def test_a_late_answer_takes_no_newer_ones_place_beside_the_pairs(browser, measured):
+    _, pages = measured
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame"), ready(page, "Orthoimage")
+        expect(page.locator("#fit .figures")).to_contain_text("20")
+        page.evaluate(
+            """() => {
+              window.ghosts = new Set();
+              const count = () => window.ghosts.add(document.querySelectorAll("[data-id^=ghost]").length);
+              new MutationObserver(count).observe(document.querySelector("#panes"), { subtree: true, childList: true });
+            }"""
+        )
+        late = hold_first(page, "**/transform")
+        placed = fitted(page, pane(page, "Reference frame"), FRAME_SIZE)
+        for share in (0.4, 0.6):  # two clicks, whose counterparts are asked for
+            page.mouse.click(*np.round(placed.window(np.array(FRAME_SIZE) * share)))
+            page.wait_for_timeout(NO_DOUBLE_CLICK_MS)
+        route = arrived(page, late)
+        page.wait_for_timeout(500)  # in which the later one could be answered
+        with page.expect_response("**/transform"):
+            route.continue_()
+        page.wait_for_timeout(500)
+        expect(page.locator("[data-id^=ghost]")).to_have_count(2)
+        assert 1 not in page.evaluate("[...window.ghosts]")  # the answer from before the second click
+
+        late = hold_first(page, "**/rectified.jpg*")
+        compare(page, "Blend")
+        route = arrived(page, late)
+        page.get_by_role("checkbox", name="Pair 2 counts").click()
+        saved(page)
+        red = BytesIO()
+        Image.new("RGB", Image.open(BytesIO(route.fetch().body())).size, (255, 0, 0)).save(red, "JPEG")
+        page.wait_for_timeout(1500)
+        route.fulfill(body=red.getvalue(), content_type="image/jpeg")
+        page.wait_for_timeout(1500)
+        colours = np.asarray(Image.open(BytesIO(pane(page, "Orthoimage").screenshot())).convert("RGB"), dtype=float)
+        assert (colours[..., 0] - colours[..., 2]).mean() < RED_LEVELS
 
 
 def shown_like(page: Page, ortho: Locator, expected: np.ndarray, where: np.ndarray, least: float) -> np.ndarray:

@@ -203,12 +203,16 @@ def test_edits_wait_in_the_window_for_a_server_that_does_not_answer(browser, pro
         expect(page.locator(".save-state")).to_have_text("Not saved yet")
         for pair in (4, 5):
             expect(page.get_by_role("checkbox", name=f"Pair {pair} counts")).not_to_be_checked()
+        figures = page.locator("#fit .figures")
+        expect(figures).to_contain_class("awaited")  # they are of the pairs before
+        expect(figures).to_contain_text("18 / 20")
         to_step(page, "Regions")
         assert arrived(page, asked) == "beforeunload"
         page.context.set_offline(False)
         saved(page)
         expect(page.get_by_text("The server does not answer – trying again")).to_be_hidden()
-        expect(page.locator("#fit .figures")).to_contain_text("18 / 20")
+        expect(figures).not_to_contain_class("awaited")
+        expect(figures).to_contain_text("18 / 20")
     assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [4, 5]
 
 
@@ -706,6 +710,11 @@ def test_a_file_is_chosen_by_typing_its_path(browser, project):
         path.fill(str(folder / "none.yaml"))
         path.press("Enter")
         expect(page.get_by_role("dialog")).to_contain_text("no such file")
+        (folder / "wrong.yaml").write_text("not a lens")
+        path.fill(str(folder / "wrong.yaml"))
+        path.press("Enter")
+        expect(lens.locator(".refusal")).to_contain_text("wrong.yaml")
+        lens.get_by_role("button", name="Choose on this computer").click()
         path.fill(str(folder))
         path.press("Enter")
         expect(page.get_by_role("option", name="again.yaml")).to_be_visible()
@@ -714,6 +723,7 @@ def test_a_file_is_chosen_by_typing_its_path(browser, project):
         expect(page.get_by_role("dialog")).to_have_count(0)
         saved(page)
         eventually(lambda: read_project(folder).inputs.lens == "again.yaml")
+        expect(lens.locator(".refusal")).to_be_empty()
 
 
 def test_what_is_missing_is_named_with_the_way_to_it(browser, project, server):
@@ -770,7 +780,10 @@ def test_inputs_are_sent_taken_back_and_calibrated(browser, project, tmp_path):
         wrong.write_text("not a lens")
         chooser.value.set_files(wrong)
         expect(page.get_by_role("alert")).to_contain_text("wrong.yaml")
+        expect(lens.locator(".refusal")).to_contain_text("wrong.yaml")
         expect(lens.locator(".badge")).to_have_text("understood")  # the lens before stays
+        lens.get_by_role("button", name="Dismiss").click()
+        expect(lens.locator(".refusal")).to_be_empty()
         assert read_project(folder).inputs.lens == "lens.yaml"
 
         lens.get_by_role("button", name="Calibrate…").click()
@@ -890,14 +903,55 @@ def test_projects_are_copied_renamed_archived_restored_and_deleted_with_undo(bro
         assert not folder.exists()
         page.get_by_role("button", name="Undo", exact=True).click()
         expect(card).to_have_count(1)
+        expect(page.get_by_role("button", name="Deleted projects")).to_have_count(0)
+        act(page, card, "Delete")
+        page.reload()  # and nothing is left to undo it
+        page.get_by_role("button", name="Deleted projects (1)").click()
+        expect(page.get_by_role("dialog")).to_contain_text(f"in folder {folder.name} · deleted just now · kept until")
+        page.get_by_role("button", name="Restore Sample by hand").click()
+        expect(page.locator(".toast")).to_contain_text("Sample by hand was restored.")
+        expect(card).to_have_count(1)
+        expect(page.get_by_role("button", name="Deleted projects")).to_have_count(0)
         before = page.locator("[data-project]").count()
         with page.expect_file_chooser() as chooser:
             page.get_by_role("button", name="Restore archive…").click()
         chooser.value.set_files(archive)
         expect(page.locator("[data-project]")).to_have_count(before + 1)
-        page.locator(".toast").get_by_role("button", name="Open").click()
+        page.locator(".toast").get_by_role("button", name="Open").last.click()
         expect(page.locator(".project-name")).to_have_text("Sample by hand")
     assert read_project(folder).name == "Sample by hand"
+
+
+def test_deleted_projects_that_cannot_be_asked_for_are_asked_for_again(browser, project):
+    folder, pages = project
+    address = pages.split("/p/")[0]
+    with watched(browser, address) as page:
+        page.goto(address)
+        act(page, page.locator(f"[data-project='{folder.name}']"), "Delete")
+        deleted = page.get_by_role("button", name=re.compile(r"Deleted projects \(\d+\)"))
+        expect(deleted).to_be_visible()
+        answer_first(page, "**/api/trash", lambda route: route.abort())
+        deleted.click()
+        expect(page.get_by_role("alert")).to_contain_text("does not answer")
+        page.get_by_role("button", name="Try again").click()
+        row = page.get_by_role("dialog").locator(f"[data-project='{folder.name}']")
+        expect(row).to_be_visible()
+        page.request.post(
+            f"{address}/api/projects/untrash",
+            data={"undo_token": token_of(page, address, folder.name)},
+            headers={"X-Rooftrack": "1", "Origin": address},
+        )  # by another window
+        row.get_by_role("button", name="Restore").click()
+        expect(page.get_by_role("alert")).to_contain_text("The trash no longer holds this project.")
+        expect(page.locator(f"[data-project='{folder.name}']")).to_have_count(1)
+
+
+def token_of(page: Page, address: str, name: str) -> str:
+    """Return what fetches a deleted project back."""
+    (token,) = [
+        deleted["undo_token"] for deleted in page.request.get(f"{address}/api/trash").json() if deleted["id"] == name
+    ]
+    return token
 
 
 def act(page: Page, card, item: str, name: str | None = None) -> None:

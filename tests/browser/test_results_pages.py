@@ -160,6 +160,32 @@ def test_an_answer_from_before_a_method_was_chosen_is_not_taken_for_the_new_one(
         assert page.locator(".toast").all_inner_texts() == []
 
 
+@pytest.mark.parametrize(("step", "values"), [("track", "/results$"), ("drift", "/api/.*/drift")])
+def test_a_plot_without_values_has_no_numbers_along_its_axes(browser, finished, step, values):
+    held: list[Route] = []
+    answered: list[Route] = []
+    with watched(browser, finished) as page:
+        page.add_init_script(
+            """window.written = [];
+            const write = CanvasRenderingContext2D.prototype.fillText;
+            CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
+              if (text !== "" && this.canvas.closest(".plot")) window.written.push(text);
+              write.call(this, text, ...place);
+            };"""
+        )
+        page.route(re.compile(values), lambda route: route.continue_() if answered else held.append(route))
+        page.goto(f"{finished}/{step}")
+        arrived(page, held)
+        expect(page.locator(".plot .u-over").first).to_be_visible()
+        page.wait_for_timeout(300)  # in which a plot is drawn in its final size
+        assert page.evaluate("window.written") == []
+        expect(page.locator(".plot-unit:not(:empty)")).to_have_count(0)
+        answered.extend(held)
+        for results in answered:
+            results.continue_()
+        page.wait_for_function("() => window.written.some((text) => /^\\d+ s$/.test(text))")
+
+
 def test_what_cannot_be_asked_is_told_and_asked_again_and_no_older_overlay_stays(browser, project):
     _, pages = project
     reviews: list[Route] = []

@@ -27,7 +27,7 @@ def test_messages_add_no_scrollbar_and_do_not_pile_up(browser, project):
         assert page.evaluate("document.documentElement.scrollHeight") == page.evaluate("innerHeight")
 
 
-def test_a_message_takes_no_click_from_what_lies_below_it(browser, project):
+def test_a_message_lies_over_no_tool_and_takes_no_click_from_what_lies_below_it(browser, project):
     _, pages = project
     with watched(browser, pages) as page:
         page.goto(f"{pages}/correspondences")
@@ -35,13 +35,13 @@ def test_a_message_takes_no_click_from_what_lies_below_it(browser, project):
         page.evaluate(
             """async () => (await import("/static/js/components/toast.js")).toast("A word.", { seconds: 0 })"""
         )
-        words, menu = page.locator(".toast"), page.get_by_role("button", name="Import and export")
-        over, under = words.bounding_box(), menu.bounding_box()
-        assert over["x"] < under["x"] + under["width"] / 2 < over["x"] + over["width"]
-        assert over["y"] < under["y"] + under["height"] / 2 < over["y"] + over["height"]
-        menu.click()
-        expect(page.get_by_role("menuitem", name="Import")).to_be_visible()
-        page.keyboard.press("Escape")
+        words, side = page.locator(".toast"), page.locator(".side").bounding_box()
+        over = words.bounding_box()
+        assert side["x"] < over["x"] < over["x"] + over["width"] < side["x"] + side["width"]
+        assert over["y"] > page.locator("#selection").bounding_box()["y"] + 100
+        middle = over["x"] + over["width"] / 2, over["y"] + over["height"] / 2
+        page.mouse.click(*middle)
+        expect(page.locator("#pairs tbody tr[aria-selected=true]")).to_have_count(1)
         words.get_by_role("button", name="Dismiss").click()
         expect(words).to_have_count(0)
 
@@ -72,6 +72,7 @@ def test_undo_takes_back_what_was_done_last(browser, project):
         page.keyboard.press("Control+Shift+z")
         expect(half).to_have_count(1)
         page.keyboard.press("Control+Shift+z")
+        expect(page.locator(".toast")).to_have_text("Redone: “Delete pair 3”")
         expect(pair).to_have_count(0)
 
         page.get_by_role("button", name="Import and export").click()
@@ -86,9 +87,9 @@ def test_undo_takes_back_what_was_done_last(browser, project):
         assert [pair.id for pair in read_project(folder).correspondences] == [1, 2, *range(4, 21)]
         for _ in range(5):  # faster than it is answered, and more than there is
             page.keyboard.press("Control+z")
+        expect(page.locator(".toast")).to_have_text("Undone: “Delete pair 3”")
         expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(20)
         expect(page.get_by_role("button", name="Undo (Ctrl+Z)")).to_be_disabled()
-        expect(page.locator(".toast")).to_have_count(0)
         saved(page)
     assert [pair.id for pair in read_project(folder).correspondences] == [*range(1, 21)]
 

@@ -141,8 +141,12 @@ def test_a_frame_asked_for_while_the_server_is_gone_comes_when_it_is_back(browse
         with serving(tmp_path, port) as address:
             page.goto(f"{address}/p/sample/review?frame=30")
             expect(page.get_by_label("This frame", exact=True)).to_contain_text("used", timeout=60_000)
+            before = page.locator("main").bounding_box()
         bar = page.get_by_text("The server does not answer – trying again")
         expect(bar).to_be_visible(timeout=20_000)
+        whole, main = page.locator(".connection-bar").bounding_box(), page.locator("main").bounding_box()
+        assert main["y"] == before["y"] + whole["height"] == whole["y"] + whole["height"]
+        assert main["y"] + main["height"] == before["y"] + before["height"]  # the page gives way, and is still whole
         page.keyboard.press("End")
         expect(page.get_by_label("This frame", exact=True)).to_contain_text("Frame 599")
         expect(page.locator(".toast")).to_have_count(0)  # the bar says it already

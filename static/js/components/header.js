@@ -121,7 +121,7 @@ export function projectHeader(store, step, events) {
   ]);
 }
 
-/** A bar below the header while the server does not answer. @param {import("../lib/events.js").ServerEventStream} events @param {ProjectStore} store */
+/** A bar at the foot of the header while the server does not answer. @param {import("../lib/events.js").ServerEventStream} events @param {ProjectStore} store */
 export function tellConnection(events, store) {
   const words = h("span");
   const bar = h("p", { class: "connection-bar", role: "status", hidden: true }, icon("warn", "small"), words);

@@ -35,6 +35,7 @@ export async function openPage(step) {
     projectHeader(store, step, events);
     tellConnection(events, store);
     tellTroubles(store);
+    tellSteps(store);
     window.addEventListener("beforeunload", (event) => store.hasUnsaved && event.preventDefault());
     events.on("hello", ({ revision }) => store.heardOf(revision));
     events.on("project", ({ revision }) => store.heardOf(revision));
@@ -78,6 +79,16 @@ function tellTroubles(store) {
     }),
   );
   store.on("refused", ({ label, error }) => toast(`“${label}” was not saved. ${sentence(error)}`, { tone: "bad" }));
+}
+
+/** What is undone may be an edit of another page, without a sign on this one. @param {ProjectStore} store */
+function tellSteps(store) {
+  /** @type {() => void} */
+  let takeAway = () => undefined;
+  store.on("stepped", ({ which, label }) => {
+    takeAway();
+    takeAway = toast(`${which === "undo" ? "Undone" : "Redone"}: “${label}”`, { seconds: 4 });
+  });
 }
 
 /** "“Nudge pair 3” and 2 more edits were" @param {string[]} labels */

@@ -14,6 +14,14 @@ const ALIKE_PX = 3;
 const TURNED_PX = 3;
 
 /**
+ * What has a place on the x axis; nothing has while no x is known.
+ * @template Mark
+ * @param {Plot} plot
+ * @param {Mark[]} marks
+ */
+const placed = (plot, marks) => (plot.hasX ? marks : []);
+
+/**
  * Fill the intervals behind the curves.
  * @param {Plot} plot
  * @param {import("../../vendor/uplot/uPlot.esm.js")} u
@@ -26,7 +34,7 @@ export function drawIntervals(plot, u) {
   g.beginPath();
   g.rect(left, top, width, height);
   g.clip();
-  for (const interval of plot.intervals) {
+  for (const interval of placed(plot, plot.intervals)) {
     const from = u.valToPos(interval.from, "x", true);
     const to = u.valToPos(interval.to, "x", true);
     g.fillStyle = plot.faded(interval.colour, 0.08);
@@ -51,7 +59,7 @@ export function drawIntervalNames(plot, u) {
   g.font = `600 ${11 * scale}px Inter, system-ui, sans-serif`;
   g.textBaseline = "top";
   g.textAlign = "left";
-  for (const interval of plot.intervals) {
+  for (const interval of placed(plot, plot.intervals)) {
     const from = Math.max(u.valToPos(interval.from, "x", true), left);
     const to = Math.min(u.valToPos(interval.to, "x", true), left + width);
     const wide = g.measureText(interval.label).width;
@@ -77,7 +85,7 @@ export function drawVerticals(plot, u) {
   g.font = `600 ${11 * scale}px Inter, system-ui, sans-serif`;
   g.textBaseline = "top";
   g.textAlign = "left";
-  plot.verticals.forEach((vertical, i) => {
+  placed(plot, plot.verticals).forEach((vertical, i) => {
     const x = u.valToPos(vertical.at, "x", true);
     if (x < left || x > left + width) return;
     g.fillStyle = g.strokeStyle = plot.colour(vertical.colour);
@@ -191,7 +199,7 @@ export class IntervalHandles {
 
   place() {
     const wanted = new Set();
-    for (const interval of this.plot.intervals) {
+    for (const interval of placed(this.plot, this.plot.intervals)) {
       if (!interval.editable) continue;
       for (const end of /** @type {const} */ (["from", "to"])) {
         wanted.add(`${interval.key}/${end}`);

@@ -70,6 +70,7 @@ export class Plot extends Emitter {
     /** @type {[number, number] | null} */ this.domain = null;
     /** @type {[number, number] | null} */ this.view = null;
     /** @type {number | null} */ this.head = null;
+    /** Whether a curve shown has a value; without one, no number is written along y. */ this.hasY = false;
     /** @type {{factor: number, unit: string}} */ this.written = { factor: 1, unit: options.unit ?? "" };
     /** @type {Map<string, string>} */ this.colours = new Map();
     this.legend = h("span", { class: "plot-legend", role: "group", "aria-label": "Curves" });
@@ -165,7 +166,7 @@ export class Plot extends Emitter {
   /** Move the play head; null hides it. @param {number | null} x */
   setPlayHead(x) {
     this.head = x;
-    const visible = x !== null && x >= this.extent[0] && x <= this.extent[1];
+    const visible = x !== null && this.hasX && x >= this.extent[0] && x <= this.extent[1];
     this.playHead.hidden = !visible;
     if (visible) this.playHead.style.transform = `translateX(${this.u.valToPos(/** @type {number} */ (x), "x")}px)`;
     if (this.u.cursor.idx == null) this.writeValues();
@@ -182,6 +183,11 @@ export class Plot extends Emitter {
   get extent() {
     const { min, max } = this.u.scales.x ?? {};
     return [min ?? 0, max ?? 1];
+  }
+
+  /** Whether any x is known; else no number is written along it, and nothing lies at a place of it. */
+  get hasX() {
+    return this.domain !== null || (this.data[0]?.length ?? 0) > 0;
   }
 
   /** All of x. @returns {[number, number]} */
@@ -211,6 +217,7 @@ export class Plot extends Emitter {
 
   /** @returns {uPlot} */
   build() {
+    this.hasY = false;
     const plot = new uPlot(this.uplotOptions(), this.data, this.body);
     plot.over.append(this.playHead, this.handles.layer);
     return plot;
@@ -250,6 +257,7 @@ export class Plot extends Emitter {
     const ink = () => this.colour("--plot-axis");
     const unit = this.options.xUnit ?? "s";
     const values = (/** @type {uPlot} */ _, /** @type {number[]} */ ticks) => {
+      if (!this.hasX) return ticks.map(() => "");
       const last = ticks.findLastIndex((tick) => tick != null); // a logarithmic axis writes only some of its ticks
       return ticks.map((tick, i) => (tick == null ? "" : i === last ? `${round(tick)} ${unit}` : round(tick)));
     };
@@ -268,7 +276,7 @@ export class Plot extends Emitter {
   /** @returns {uPlot.Axis} */
   axisY() {
     const values = (/** @type {uPlot} */ _, /** @type {number[]} */ ticks) =>
-      ticks.map((tick) => (tick == null ? "" : round(tick * this.written.factor).replace("-", "−")));
+      ticks.map((tick) => (tick == null || !this.hasY ? "" : round(tick * this.written.factor).replace("-", "−")));
     return {
       stroke: () => this.colour("--plot-axis"),
       size: 48,
@@ -300,13 +308,20 @@ export class Plot extends Emitter {
 
   /** @param {number} low @param {number} high @returns {[number, number]} with air above and below */
   rangeY(low, high) {
-    if (low == null || high == null) [low, high] = this.options.logY ? [1e-4, 1e-2] : [-0.01, 0.01];
+    this.hasY = low != null && high != null;
+    if (!this.hasY) return this.rangeOfNothing();
     if (this.options.logY) return this.rangeLog(low, high);
     const lacking = ((this.options.leastSpan ?? 1e-9) - (high - low)) / 2;
     const air = Math.max((high - low) * 0.08, lacking);
     const range = /** @type {[number, number]} */ ([this.options.zeroY ? 0 : low - air, high + air]);
     this.chooseUnit(range);
     return range;
+  }
+
+  /** @returns {[number, number]} for a grid without numbers */
+  rangeOfNothing() {
+    if (this.options.unit === "m") this.unitLabel.textContent = "";
+    return this.options.logY ? [1e-4, 1e-2] : [-0.01, 0.01];
   }
 
   /** @param {number} low @param {number} high @returns {[number, number]} at most five decades */

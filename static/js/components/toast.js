@@ -1,4 +1,4 @@
-// Short messages under the header, and a voice for screen readers.
+// Short messages in the lower right corner, and a voice for screen readers.
 
 import { h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";

@@ -62,8 +62,12 @@ export function ago(then_s, now_s = Date.now() / 1000) {
   if (age < 60) return "just now";
   if (age < 3600) return `${Math.floor(age / 60)} min ago`;
   if (age < 86400) return `${Math.floor(age / 3600)} h ago`;
-  return new Date(then_s * 1000).toLocaleDateString(undefined, { day: "numeric", month: "short", year: "numeric" });
+  return day(then_s);
 }
+
+/** "3 May 2026", as it is written here. @param {number} then_s seconds since 1970 */
+export const day = (then_s) =>
+  new Date(then_s * 1000).toLocaleDateString(undefined, { day: "numeric", month: "short", year: "numeric" });
 
 /** "1 pair", "3 pairs". @param {number} n @param {string} one @param {string} [many] */
 export const plural = (n, one, many = `${one}s`) => `${count(n)} ${n === 1 ? one : many}`;

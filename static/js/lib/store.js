@@ -17,6 +17,7 @@ import { ApiError, get, isConflict, isOffline, post, projectPath, put, untilNext
  * @property {{project: Project, previous: Project, origin: "edit" | "saved" | "server" | "undo"}} change
  * @property {Saving} saving
  * @property {{labels: string[], error: unknown, again: () => void}} lost  taken back for no fault of theirs: another tab was faster; `again` repeats them in order on the newest state
+ * @property {{which: "undo" | "redo", label: string}} stepped back or forward over the edit of that label
  * @property {{label: string, error: unknown}} refused  the server found the edit wrong; it was taken back, those behind it go on
  */
 
@@ -103,9 +104,11 @@ export class ProjectStore extends Emitter {
   /** @param {"undo" | "redo"} which */
   #step(which) {
     return this.#then(async () => {
-      if (!this.state[`can_${which}`]) return; // asked for faster than answered: those before took the last one
+      const label = this.state[`${which}_label`];
+      if (label === null) return; // asked for faster than answered: those before took the last one
       try {
         this.#adopt(await post(projectPath(this.id, which), { revision: this.revision }), "undo");
+        this.emit("stepped", { which, label });
       } catch (error) {
         if (!isConflict(error)) throw error;
         await this.#reload();

@@ -1,6 +1,6 @@
 // Step 3: pairs of places in the reference frame and on the orthoimage. Two panes, no modes.
 
-import { ApiError, get, post, projectPath } from "../lib/api.js";
+import { get, post, projectPath } from "../lib/api.js";
 import { orthoFromWorld, subtract, worldFromOrtho } from "../lib/coordinates.js";
 import { find, h } from "../lib/dom.js";
 import { downloadText, pickFiles } from "../lib/download.js";
@@ -9,6 +9,7 @@ import { latest } from "../lib/latest.js";
 import { setView, viewNumber, viewText } from "../lib/view-state.js";
 import { PaneImage } from "../components/pane-image.js";
 import { activePane, nudgeKeys, paneKeys } from "../components/pane-keys.js";
+import { FAINT_AFTER_MS, delayedSign } from "../components/delayed-sign.js";
 import { menuButton } from "../components/menu.js";
 import { numberField } from "../components/number-field.js";
 import { openPage } from "../components/page.js";
@@ -91,23 +92,42 @@ const askFit = latest(
   (/** @type {Correspondence[]} */ correspondences) => post(projectPath(page.id, "fit"), { correspondences }),
   (/** @type {Fit} */ answer) => {
     fit = answer;
+    fitAwaited.end();
     showFit();
   },
   toastError,
 );
 
-/** Counterparts of waiting halves, where the saved pairs already tie the views together. */
-async function findGhosts() {
-  for (const side of sides) {
-    const halves = fit.state === "ok" ? halvesWithout(slots, side.side) : [];
-    const placed = halves.map((half) => /** @type {Point} */ (half[otherSide(side.side)]));
-    try {
-      side.setGhosts(halves, await transform(side === frame ? "plan" : "raw", side.frameName, placed));
-    } catch (error) {
-      if (!(error instanceof ApiError)) throw error;
-      side.setGhosts([], []);
-    }
-  }
+/** Whether the numbers shown are of earlier pairs: the server takes its time, or does not answer. */
+let isEarlier = false;
+const fitAwaited = delayedSign(FAINT_AFTER_MS, (on) => {
+  isEarlier = on;
+  showNumbers();
+});
+
+/** @param {Correspondence[]} correspondences */
+function fitAnew(correspondences) {
+  fitAwaited.begin();
+  if (isEarlier) showNumbers();
+  void askFit(correspondences);
+}
+
+/** Asks for the counterparts of waiting halves on a side. @param {PairPane} side */
+const ghostsOf = (side) =>
+  latest(
+    async () => {
+      // Where the saved pairs already tie the views together.
+      const halves = fit.state === "ok" ? halvesWithout(slots, side.side) : [];
+      const placed = halves.map((half) => /** @type {Point} */ (half[otherSide(side.side)]));
+      return { halves, places: await transform(side === frame ? "plan" : "raw", side.frameName, placed) };
+    },
+    ({ halves, places }) => side.setGhosts(halves, places),
+    () => side.setGhosts([], []), // no fit, no ghost: the fit panel says why
+  );
+const askGhosts = sides.map(ghostsOf);
+
+function findGhosts() {
+  for (const ask of askGhosts) void ask(null);
 }
 
 // --- side panel
@@ -116,10 +136,15 @@ const showFitFigures = fitPanel(find("#fit"));
 const table = pairsTable(find("#pairs"), { onSelect: goTo, onToggle: (id) => slots.toggle(id) });
 const selection = selectionPanel(find("#selection"), slots, { goTo });
 
-function showFit() {
+function showNumbers() {
   const pairs = store.project.correspondences;
-  showFitFigures(fit, pairs.filter((pair) => pair.enabled).length, pairs.length);
-  table.show(pairs, fit);
+  const enabled = pairs.filter((pair) => pair.enabled).length;
+  showFitFigures(fit, { enabled, total: pairs.length, awaited: isEarlier });
+  table.show(pairs, fit, isEarlier);
+}
+
+function showFit() {
+  showNumbers();
   frame.residuals = residuals((pair, predicted) => subtract(predicted.predicted_px, pair.frame_px));
   ortho.residuals = residuals(({ ground_m }, { predicted_m }) =>
     grid === null ? null : subtract(orthoFromWorld(grid, predicted_m), orthoFromWorld(grid, ground_m)),
@@ -127,7 +152,7 @@ function showFit() {
   // as long for as many metres as in the frame
   if (grid !== null && fit.rms_px && fit.rms_m) ortho.arrowPx = (ARROW_PX * grid.pixel_size_m * fit.rms_px) / fit.rms_m;
   sides.forEach((side) => side.draw());
-  void findGhosts();
+  findGhosts();
 }
 
 /**
@@ -177,7 +202,7 @@ for (const side of sides) {
     if (linked && fit.state === "ok") follow(side);
   });
   side.on("moving", ({ id, side: which, point }) => {
-    askFit(store.project.correspondences.map((pair) => (pair.id === id ? { ...pair, [which]: point } : pair)));
+    fitAnew(store.project.correspondences.map((pair) => (pair.id === id ? { ...pair, [which]: point } : pair)));
   });
 }
 
@@ -329,7 +354,7 @@ function showFrame(image, { number, und }) {
   frame.chrome.setTitle(`Frame ${number} · ${und ? "undistorted" : "raw"}`);
   frame.chrome.setNote();
   frame.refresh();
-  void findGhosts();
+  findGhosts();
 }
 
 function loadOrtho() {
@@ -453,17 +478,17 @@ page.keys([
 slots.on("change", () => {
   sides.forEach((side) => side.refresh());
   showSelection();
-  void findGhosts();
+  findGhosts();
 });
 store.on("change", ({ project, previous, origin }) => {
   sides.forEach((side) => side.refresh());
   if (project.reference_frame !== previous.reference_frame) referenceFrame.set(project.reference_frame);
   if (shownOf(project) !== shownOf(previous)) void loadFrame();
   if (origin === "edit" || JSON.stringify(project.correspondences) !== JSON.stringify(previous.correspondences))
-    askFit(project.correspondences);
+    fitAnew(project.correspondences);
   if (origin === "saved") {
     compare.refresh();
-    void findGhosts();
+    findGhosts();
   }
   if (project.correspondences.length > previous.correspondences.length)
     announce(`${plural(project.correspondences.length, "pair")} placed`);
@@ -471,7 +496,7 @@ store.on("change", ({ project, previous, origin }) => {
 page.events.on("orthoimage", () => void loadOrtho());
 page.events.on("inputs", ({ kind }) => ["video", "lens"].includes(kind) && void loadFrame());
 
-askFit(store.project.correspondences);
+fitAnew(store.project.correspondences);
 await Promise.all([loadFrame(), loadOrtho()]);
 sides.forEach((side) => side.restoreView());
 showSelection();

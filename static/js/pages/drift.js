@@ -7,6 +7,7 @@ import { latest } from "../lib/latest.js";
 import { told } from "../lib/problems.js";
 import { setView, viewText } from "../lib/view-state.js";
 import { busyOver } from "../components/busy.js";
+import { FAINT_AFTER_MS, delayedSign } from "../components/delayed-sign.js";
 import { earlierNote } from "../components/earlier-note.js";
 import { AXES, fetchHistory, fetchResults } from "../components/histories.js";
 import { INTERVALS, intervalFields } from "../components/interval-fields.js";
@@ -32,7 +33,6 @@ import { toastError } from "../components/toast.js";
 const LOWEST_HZ = 0.05;
 const HIGHEST_HZ = 0.5;
 const CORNER_STEP_HZ = 0.005;
-const FAINT_AFTER_MS = 120; // an answer that is quicker needs no sign
 const TOLD_AFTER_MS = 600;
 
 const page = await openPage("drift");
@@ -53,8 +53,6 @@ let geometric = null;
 let answer = null;
 /** @type {Sweep | null} */
 let sweep = null;
-/** @type {number[]} timers of the signs that an answer is awaited */
-let awaited = [];
 
 // the page
 const mainArea = h("div", { class: "drift-main" });
@@ -146,6 +144,8 @@ const spectrumPlot = new Plot(lowerArea, {
 });
 const filtering = h("span", { class: "badge accent", role: "status", hidden: true }, "Solving…");
 solving.before(filtering);
+const faintSign = delayedSign(FAINT_AFTER_MS, setFaint);
+const filteringSign = delayedSign(TOLD_AFTER_MS, (on) => (filtering.hidden = !on || !solving.hidden));
 const fields = intervalFields(intervalBox, saveInterval, end_s);
 const load = latest(askResults, showResults, showProblem);
 const refilter = latest(askFilter, showAnswer, showProblem);
@@ -306,11 +306,10 @@ function ask() {
 
 /** Until the answer is there, the figures, the curve and the words of the last one are not for this corner. */
 function filterAnew() {
-  if (awaited.length === 0 && answer !== null)
-    awaited = [
-      window.setTimeout(() => setFaint(true), FAINT_AFTER_MS),
-      window.setTimeout(() => (filtering.hidden = !solving.hidden), TOLD_AFTER_MS),
-    ];
+  if (answer !== null) {
+    faintSign.begin();
+    filteringSign.begin();
+  }
   refilter(corner_hz);
 }
 
@@ -355,10 +354,8 @@ function showAnswer(newest) {
   opened();
   earlier.show(results, { method: store.project.method, isEarlier: newest.is_earlier });
   const isBare = showNothing(newest.status);
-  awaited.forEach(window.clearTimeout);
-  awaited = [];
-  filtering.hidden = true;
-  setFaint(false);
+  faintSign.end();
+  filteringSign.end();
   drawHistory();
   showFigures();
   fill(
@@ -371,7 +368,7 @@ function showAnswer(newest) {
 /** @param {unknown} error */
 function showProblem(error) {
   opened();
-  filtering.hidden = true;
+  filteringSign.end();
   if (answer === null) tellNothing(sentence(error));
   else toastError(error);
 }

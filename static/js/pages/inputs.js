@@ -57,6 +57,8 @@ const KINDS = /** @type {const} */ ([
     why: "Optional: a GPS record on the roof, to compare the result with.",
   },
 ]);
+/** What undo calls the choice of a file. @param {{title: string}} entry */
+const choosing = ({ title }) => `Choose ${title.toLowerCase()}`;
 
 const calibrate = h(
   "button",
@@ -82,7 +84,7 @@ const cards = new Map(
     inputCard({
       ...entry,
       projectId: page.id,
-      onPath: (path) => store.edit(`Choose ${entry.title.toLowerCase()}`, (draft) => setInput(draft, entry.kind, path)),
+      onPath: (path) => store.edit(choosing(entry), (draft) => setInput(draft, entry.kind, path)),
       onChange: () => void store.refresh().catch(toastError),
       onRemove:
         entry.kind === "video"
@@ -91,6 +93,9 @@ const cards = new Map(
       more: FURTHER[entry.kind],
     }),
   ]),
+);
+store.on("refused", ({ label, error }) =>
+  KINDS.filter((entry) => label === choosing(entry)).forEach(({ kind }) => cards.get(kind)?.refuse(error)),
 );
 const job = jobCard();
 const report = calibrationReport(page.id);

@@ -3,14 +3,16 @@
 import { get, post, projectPath, put, remove, upload } from "../lib/api.js";
 import { fill, find, h, svg } from "../lib/dom.js";
 import { pickFiles } from "../lib/download.js";
-import { ago, fixed } from "../lib/format.js";
+import { ago, count, fixed } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
-import { told } from "../lib/problems.js";
 import { bindKeys } from "../lib/keys.js";
+import { latest } from "../lib/latest.js";
+import { told } from "../lib/problems.js";
 import { askName } from "../components/dialog.js";
 import { STEPS, projectsHeader, statusMark, stepUrl } from "../components/header.js";
 import { menuButton } from "../components/menu.js";
 import { toast, toastError } from "../components/toast.js";
+import { chooseDeleted, deletedProjects } from "./projects/deleted-projects.js";
 import { newProjectDialog } from "./projects/new-project.js";
 
 /** @typedef {import("../lib/types.js").Steps} Steps */
@@ -29,6 +31,13 @@ const restore = h(
   icon("upload"),
   "Restore archive…",
 );
+const deletedCount = h("span");
+const deleted = h(
+  "button",
+  { class: "button quiet", type: "button", hidden: true, onclick: () => void restoreDeleted() },
+  icon("trash"),
+  deletedCount,
+);
 
 projectsHeader();
 fill(
@@ -46,19 +55,29 @@ fill(
         "Displacement of a structure from a drone video: each project is a folder with its inputs, your decisions and the results.",
       ),
     ),
-    h("div", { class: "toolbar" }, restore, create),
+    h("div", { class: "toolbar" }, deleted, restore, create),
   ),
   list,
 );
 bindKeys([{ keys: "C", group: "Projects", label: "New project", run: () => void newProject() }]);
 
-async function load() {
-  try {
-    const projects = /** @type {Listed[]} */ (await get("projects"));
-    fill(list, projects.length === 0 ? emptyState() : projects.map(card));
-  } catch (error) {
-    toastError(error);
-  }
+const askProjects = latest(
+  () => get("projects"),
+  (/** @type {Listed[]} */ projects) => fill(list, projects.length === 0 ? emptyState() : projects.map(card)),
+  toastError,
+);
+const askDeleted = latest(
+  deletedProjects,
+  ({ length }) => {
+    deleted.hidden = length === 0;
+    deletedCount.textContent = `Deleted projects (${count(length)})`;
+  },
+  toastError,
+);
+
+function load() {
+  void askProjects(null);
+  void askDeleted(null);
 }
 
 /** The video's first frame. @param {Listed} project */
@@ -135,7 +154,7 @@ async function attempt(task) {
   } catch (error) {
     toastError(error);
   }
-  await load();
+  load();
 }
 
 async function newProject() {
@@ -185,6 +204,21 @@ async function removeProject(project) {
   });
 }
 
+async function restoreDeleted() {
+  const chosen = await chooseDeleted();
+  if (chosen === null) return load(); // another window may have restored some
+  await attempt(async () => {
+    const { id } = await post("projects/untrash", { undo_token: chosen.undo_token });
+    tellRestored(chosen.name, id);
+  });
+}
+
+/** @param {string} name @param {string} id */
+function tellRestored(name, id) {
+  const open = () => location.assign(`/p/${encodeURIComponent(id)}`);
+  toast(`${name} was restored.`, { tone: "good", action: { label: "Open", run: open } });
+}
+
 async function restoreArchive() {
   const [file] = await pickFiles({ accept: ".zip" });
   if (file === undefined) return;
@@ -210,8 +244,7 @@ async function restoreArchive() {
       words.textContent = `${fixed((100 * done) / total, 0)} %`;
     };
     const { id } = await upload("POST", "projects/restore", file, sent, cancel.signal);
-    const open = () => location.assign(`/p/${encodeURIComponent(id)}`);
-    toast(`${file.name} was restored.`, { tone: "good", action: { label: "Open", run: open } });
+    tellRestored(file.name, id);
   });
   row.remove();
 }
@@ -239,5 +272,5 @@ function emptyState() {
   );
 }
 
-void load();
-window.addEventListener("pageshow", (event) => event.persisted && void load());
+load();
+window.addEventListener("pageshow", (event) => event.persisted && load());

@@ -2,6 +2,7 @@
 
 import { h } from "../../lib/dom.js";
 import { clamp } from "../../lib/coordinates.js";
+import { latest } from "../../lib/latest.js";
 import { markColour } from "../../components/palette.js";
 import { toastError } from "../../components/toast.js";
 
@@ -17,7 +18,7 @@ export function compareControls(pane, { load }) {
   const buttons = /** @type {Mode[]} */ (["off", "blend", "swipe"]).map((name) =>
     h(
       "button",
-      { type: "button", "aria-pressed": String(name === mode), "data-mode": name, onclick: () => void set(name) },
+      { type: "button", "aria-pressed": String(name === mode), "data-mode": name, onclick: () => set(name) },
       { off: "Ortho", blend: "Blend", swipe: "Swipe" }[name],
     ),
   );
@@ -34,22 +35,25 @@ export function compareControls(pane, { load }) {
     if (mode !== "off") pane.mix = { mode, amount: Number(slider.value) };
     pane.invalidate();
   };
-  const set = async (/** @type {Mode} */ next) => {
+  const set = (/** @type {Mode} */ next) => {
     mode = next;
     slider.hidden = next === "off";
     for (const button of buttons) button.setAttribute("aria-pressed", String(button.dataset.mode === next));
     mix();
-    await refresh();
+    refresh();
   };
-  const refresh = async () => {
-    if (!isOn()) return pane.setOverlay(null);
-    try {
-      const image = await load();
-      if (isOn()) pane.setOverlay(image);
-    } catch (error) {
+  const ask = latest(
+    load,
+    (image) => isOn() && pane.setOverlay(image),
+    (error) => {
+      if (!isOn()) return;
       toastError(error);
-      void set("off");
-    }
+      set("off");
+    },
+  );
+  const refresh = () => {
+    if (isOn()) void ask(null);
+    else pane.setOverlay(null);
   };
   pane.addPainter((context) => {
     if (mode === "swipe" && pane.overlay !== null) drawEdge(context, pane.size[0] * pane.mix.amount, pane.size[1]);
@@ -57,14 +61,14 @@ export function compareControls(pane, { load }) {
   return {
     element,
     /** The same choice twice goes back. @param {Mode} wanted */
-    choose: (wanted) => void set(mode === wanted ? "off" : wanted),
+    choose: (wanted) => set(mode === wanted ? "off" : wanted),
     /** @param {number} amount */
     step(amount) {
       slider.value = String(clamp(Number(slider.value) + amount, 0, 1));
       mix();
     },
     /** After a saved edit the frame is rectified anew. */
-    refresh: () => void refresh(),
+    refresh,
   };
 }
 

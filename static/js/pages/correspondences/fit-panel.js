@@ -25,16 +25,17 @@ export function fitPanel(element) {
   const message = h("p", { class: "note", role: "status", hidden: true });
   const grid = h("div", { class: "coverage", role: "img" });
   const camera = h("p", { class: "small faint number" });
+  const coverage = h("div", { class: "coverage-row" }, grid, camera);
   fill(
     element,
     h("header", {}, h("h2", {}, "Fit")),
     figures,
     message,
-    h("div", { class: "coverage-row" }, grid, camera),
+    coverage,
   );
 
-  /** @param {Fit} fit @param {number} enabled @param {number} total */
-  return function show(fit, enabled, total) {
+  /** @param {Fit} fit @param {{enabled: number, total: number, awaited: boolean}} state awaited: the fit is of earlier pairs */
+  return function show(fit, { enabled, total, awaited }) {
     fill(
       figures,
       figure(total === enabled ? String(total) : `${enabled} / ${total}`, "pairs"),
@@ -53,6 +54,7 @@ export function fitPanel(element) {
         ? ["Pairs per part of the picture. Fill the empty parts first."]
         : cameraLines(fit.camera)),
     );
+    for (const part of [figures, message, coverage]) part.classList.toggle("awaited", awaited);
   };
 }
 

@@ -45,8 +45,8 @@ export function pairsTable(element, { onSelect, onToggle }) {
     columns: [
       { key: "on", title: "On", cell: counts },
       { key: "id", title: "Pair", number: true, cell: (pair) => String(pair.id), sort: (pair) => pair.id },
-      { key: "px", title: "Residual", hint: residualHint, number: true, cell: (pair) => pixels(px(pair)), sort: px },
-      { key: "cm", title: "On ground", number: true, cell: (pair) => centimetres(metres(pair)), sort: metres },
+      { key: "px", title: "Residual", hint: residualHint, number: true, tone: () => "of-fit", cell: (pair) => pixels(px(pair)), sort: px },
+      { key: "cm", title: "On ground", number: true, tone: () => "of-fit", cell: (pair) => centimetres(metres(pair)), sort: metres },
       {
         key: "loo",
         title: "Leave-one-out",
@@ -54,15 +54,16 @@ export function pairsTable(element, { onSelect, onToggle }) {
         number: true,
         cell: (pair) => pixels(leftOut(pair)),
         sort: leftOut,
-        tone: (pair) => (isBad(pair) ? "bad" : ""),
+        tone: (pair) => (isBad(pair) ? "of-fit bad" : "of-fit"),
       },
     ],
   });
   element.append(table.element);
   return {
-    /** @param {Correspondence[]} pairs @param {Fit} newest */
-    show(pairs, newest) {
+    /** @param {Correspondence[]} pairs @param {Fit} newest @param {boolean} awaited whether the fit is of earlier pairs */
+    show(pairs, newest, awaited) {
       fit = newest;
+      table.element.classList.toggle("fit-awaited", awaited);
       table.setRows(pairs);
     },
     /** @param {number | null} id */

@@ -5,7 +5,7 @@ import { pickFiles } from "../../lib/download.js";
 import { icon } from "../../lib/icons.js";
 import { told } from "../../lib/problems.js";
 import { duration, fixed, size } from "../../lib/format.js";
-import { get, projectPath, upload } from "../../lib/api.js";
+import { get, isAbort, projectPath, sentence, upload } from "../../lib/api.js";
 import { chooseFiles } from "../../components/file-browser.js";
 import { note } from "../../components/notes.js";
 import { toast, toastError } from "../../components/toast.js";
@@ -42,8 +42,21 @@ export function inputCard(options) {
   const badge = h("span", { class: "badge" });
   const body = h("div", { class: "input-body" });
   const transfer = h("div");
-  const send = (/** @type {File | undefined} */ file) => file && void sendInput(file, transfer, options);
-  const upload = async () => send((await pickFiles({ accept }))[0]);
+  const refusal = h("div", { class: "refusal" });
+  /** What was refused stays told here until it is dismissed or something else is tried. @param {unknown} error */
+  const refuse = (error) => fill(refusal, isAbort(error) ? null : refusalNote(sentence(error), () => fill(refusal)));
+  const send = async (/** @type {File | undefined} */ file) => {
+    if (file === undefined) return;
+    fill(refusal);
+    await sendInput(file, transfer, options).catch((error) => (refuse(error), toastError(error)));
+  };
+  const choose = async () => {
+    const files = await chooseFiles({ title: `Choose the ${title.toLowerCase()}`, kind });
+    if (files === null) return;
+    fill(refusal);
+    await options.onPath(files[0]).catch(toastError);
+  };
+  const pick = async () => send((await pickFiles({ accept }))[0]);
   const remove = () => void onRemove?.().catch(toastError);
   const drop = h("button", { class: "button quiet small", type: "button", hidden: true, onclick: remove }, "Remove");
   const element = h(
@@ -51,20 +64,22 @@ export function inputCard(options) {
     { class: "card input-card", "data-kind": kind, "aria-label": title },
     h("header", {}, icon(glyph), h("h2", {}, title), badge),
     body,
+    refusal,
     transfer,
     h(
       "div",
       { class: "toolbar" },
-      actionButton("folder", "Choose on this computer…", () => void chooseInput(options)),
-      actionButton("upload", "Upload…", () => void upload()),
+      actionButton("folder", "Choose on this computer…", () => void choose()),
+      actionButton("upload", "Upload…", () => void pick()),
       more,
       h("span", { class: "spring" }),
       drop,
     ),
   );
-  acceptDrops(element, ([file]) => send(file));
+  acceptDrops(element, ([file]) => void send(file));
   return {
     element,
+    refuse,
     /** @param {Record<string, any> | null} facts */
     show(facts) {
       const state = stateOf(facts);
@@ -81,21 +96,25 @@ export function inputCard(options) {
 const actionButton = (glyph, words, onclick) =>
   h("button", { class: "button small", type: "button", onclick }, icon(glyph, "small"), words);
 
-/** By its place on this computer. @param {InputCardOptions} options */
-async function chooseInput({ kind, title, onPath }) {
-  const files = await chooseFiles({ title: `Choose the ${title.toLowerCase()}`, kind });
-  if (files !== null) await onPath(files[0]).catch(toastError);
-}
+/** @param {string} words @param {() => void} dismiss */
+const refusalNote = (words, dismiss) =>
+  h(
+    "div",
+    { class: "note bad" },
+    icon("warn"),
+    h("p", {}, words),
+    h(
+      "button",
+      { class: "button quiet small icon-only", type: "button", "aria-label": "Dismiss", onclick: dismiss },
+      icon("close", "small"),
+    ),
+  );
 
 /** @param {File} file @param {HTMLElement} transfer shows how far it is @param {InputCardOptions} options */
 async function sendInput(file, transfer, { projectId, kind, onChange }) {
-  try {
-    await sendWithProgress(transfer, projectPath(projectId, `upload/${kind}`, { filename: file.name }), file);
-    onChange();
-    await tellUnderstood(projectId, kind, file.name);
-  } catch (error) {
-    toastError(error);
-  }
+  await sendWithProgress(transfer, projectPath(projectId, `upload/${kind}`, { filename: file.name }), file);
+  onChange();
+  await tellUnderstood(projectId, kind, file.name).catch(toastError);
 }
 
 /** @param {Record<string, any> | null} facts @returns {InputState} */
