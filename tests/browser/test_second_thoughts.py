@@ -90,6 +90,7 @@ def test_undo_takes_back_what_was_done_last(browser, project):
         expect(page.locator(".toast")).to_have_text("Undone: “Delete pair 3”")
         expect(page.locator("#pairs tbody tr[data-id]")).to_have_count(20)
         expect(page.get_by_role("button", name="Undo (Ctrl+Z)")).to_be_disabled()
+        expect(page.get_by_role("alert")).to_have_count(0)
         saved(page)
     assert [pair.id for pair in read_project(folder).correspondences] == [*range(1, 21)]
 

@@ -16,6 +16,9 @@ export function delayedSign(after_ms, show) {
     show(on);
   };
   return {
+    get shown() {
+      return shown;
+    },
     /** An answer is awaited, perhaps for some time already. */
     begin() {
       timer ??= window.setTimeout(() => set(true), after_ms);

@@ -3,6 +3,7 @@
 import { h } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
 import { isAbort, isOffline, sentence } from "../lib/api.js";
+import { dismissButton } from "./notes.js";
 
 /**
  * @typedef {object} ToastOptions
@@ -26,11 +27,7 @@ export function toast(message, { tone = "info", action, seconds = tone === "bad"
     h("p", {}, message),
     action &&
       h("button", { class: "button small", type: "button", onclick: () => (close(), action.run()) }, action.label),
-    h(
-      "button",
-      { class: "button quiet small icon-only", type: "button", "aria-label": "Dismiss", onclick: close },
-      icon("close", "small"),
-    ),
+    dismissButton(close),
   );
   element.dataset.message = `${tone}: ${message}`;
   for (const older of /** @type {HTMLElement[]} */ ([...tray.children]))

@@ -98,17 +98,13 @@ const askFit = latest(
   toastError,
 );
 
-/** Whether the numbers shown are of earlier pairs: the server takes its time, or does not answer. */
-let isEarlier = false;
-const fitAwaited = delayedSign(FAINT_AFTER_MS, (on) => {
-  isEarlier = on;
-  showNumbers();
-});
+/** The numbers shown are of earlier pairs: the server takes its time, or does not answer. */
+const fitAwaited = delayedSign(FAINT_AFTER_MS, () => showNumbers());
 
 /** @param {Correspondence[]} correspondences */
 function fitAnew(correspondences) {
   fitAwaited.begin();
-  if (isEarlier) showNumbers();
+  if (fitAwaited.shown) showNumbers();
   void askFit(correspondences);
 }
 
@@ -139,8 +135,8 @@ const selection = selectionPanel(find("#selection"), slots, { goTo });
 function showNumbers() {
   const pairs = store.project.correspondences;
   const enabled = pairs.filter((pair) => pair.enabled).length;
-  showFitFigures(fit, { enabled, total: pairs.length, awaited: isEarlier });
-  table.show(pairs, fit, isEarlier);
+  showFitFigures(fit, { enabled, total: pairs.length, awaited: fitAwaited.shown });
+  table.show(pairs, fit, fitAwaited.shown);
 }
 
 function showFit() {

@@ -7,7 +7,7 @@ import { told } from "../../lib/problems.js";
 import { duration, fixed, size } from "../../lib/format.js";
 import { get, isAbort, projectPath, sentence, upload } from "../../lib/api.js";
 import { chooseFiles } from "../../components/file-browser.js";
-import { note } from "../../components/notes.js";
+import { dismissButton, note } from "../../components/notes.js";
 import { toast, toastError } from "../../components/toast.js";
 import { factList } from "./facts.js";
 
@@ -98,17 +98,7 @@ const actionButton = (glyph, words, onclick) =>
 
 /** @param {string} words @param {() => void} dismiss */
 const refusalNote = (words, dismiss) =>
-  h(
-    "div",
-    { class: "note bad" },
-    icon("warn"),
-    h("p", {}, words),
-    h(
-      "button",
-      { class: "button quiet small icon-only", type: "button", "aria-label": "Dismiss", onclick: dismiss },
-      icon("close", "small"),
-    ),
-  );
+  h("div", { class: "note bad" }, icon("warn"), h("p", {}, words), dismissButton(dismiss));
 
 /** @param {File} file @param {HTMLElement} transfer shows how far it is @param {InputCardOptions} options */
 async function sendInput(file, transfer, { projectId, kind, onChange }) {
