@@ -185,6 +185,21 @@ def test_linked_views_look_at_the_same_ground(browser, pages):
         assert looked_at(page, "ortho")[2] == pytest.approx(40 / np.hypot(*(beside - middle)), rel=0.01)
 
 
+def test_a_view_is_as_the_address_says_and_stays_when_the_other_picture_comes(browser, pages):
+    with watched(browser, pages) as page:
+        late = hold_first(page, "**/orthoimage.png*")
+        page.goto(f"{pages}/correspondences?frame=400.0,300.0,1.500&ortho=1000.0,900.0,0.5000")
+        ready(page, "Reference frame")
+        route = arrived(page, late)
+        assert looked_at(page, "frame") == [400.0, 300.0, 1.5]
+        zoomed(page, pane(page, "Reference frame"), FRAME_SIZE, np.array([300.0, 500.0]), 1200.0)
+        chosen = looked_at(page, "frame")
+        route.continue_()
+        ready(page, "Orthoimage")
+        assert looked_at(page, "ortho") == [1000.0, 900.0, 0.5]
+        assert looked_at(page, "frame") == chosen
+
+
 def looked_at(page: Page, view: str) -> list[float] | None:
     """Return the middle of a pane, px of its picture, and its scale, as the address tells them."""
     page.wait_for_timeout(400)

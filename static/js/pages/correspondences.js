@@ -494,5 +494,4 @@ page.events.on("inputs", ({ kind }) => ["video", "lens"].includes(kind) && void 
 
 fitAnew(store.project.correspondences);
 await Promise.all([loadFrame(), loadOrtho()]);
-sides.forEach((side) => side.restoreView());
 showSelection();

@@ -45,6 +45,8 @@ export class PairPane extends Emitter {
   /** @type {Promise<void>} */
   #nudges = Promise.resolve();
   #asked = 0;
+  /** Where the URL says to look, until there is a picture to look at. */
+  #restored;
 
   /**
    * @param {HTMLElement} element
@@ -66,6 +68,7 @@ export class PairPane extends Emitter {
     this.loupe = new Loupe(this.pane);
     this.chrome = paneChrome(this.pane, { title, readout: (point) => [readout(point)] });
     this.#frameName = frameName;
+    this.#restored = viewNumbers(view, 3);
     this.#listen();
   }
 
@@ -96,10 +99,11 @@ export class PairPane extends Emitter {
     setView({ [this.viewName]: `${u},${v},${view.scale.toPrecision(4)}` });
   }
 
-  /** Look where the URL says. */
-  restoreView() {
-    const stored = viewNumbers(this.viewName, 3);
-    if (stored !== null) this.pane.lookAt([stored[0], stored[1]], stored[2]);
+  #restoreView() {
+    if (this.#restored === null || this.pane.image === null) return;
+    const [u, v, scale] = this.#restored;
+    this.#restored = null;
+    this.pane.lookAt([u, v], scale);
   }
 
   /** The place of a pair in this pane, or of its ghost. @param {number} id */
@@ -217,6 +221,7 @@ export class PairPane extends Emitter {
     );
     pane.on("cancel", () => this.refresh());
     pane.on("view", () => this.draw());
+    pane.on("picture", () => this.#restoreView());
     pane.element.addEventListener("keydown", ({ key }) => this.#aimsBy(key) && this.#setAim(true));
     pane.element.addEventListener("focus", () => this.#setAim(pane.element.matches(":focus-visible")));
     pane.element.addEventListener("blur", () => this.#setAim(false));
