@@ -75,6 +75,8 @@ def watched(browser: Browser, address: str, **options: Any) -> Iterator[Page]:
     context: BrowserContext = browser.new_context(**{"viewport": {"width": 1440, "height": 900}, **options})
     context.set_default_timeout(45_000)
     page = context.new_page()
+    # Asked to intercept only later, the browser would let some requests of that moment pass.
+    page.route("**/asked-by-no-page", lambda route: route.abort())
     page.on("pageerror", lambda error: _note_error(str(error), troubles))
     page.on("request", lambda request: _note_outside(request.url, address, troubles))
     page.on("websocket", lambda socket: _note_outside(socket.url, address, troubles))
