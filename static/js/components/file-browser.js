@@ -40,6 +40,8 @@ export function chooseFiles({ title, kind, multiple = false }) {
 class FileBrowser {
   /** @type {Set<string>} */
   #chosen = new Set();
+  /** The row that the last single click or the first one of a double click met. @type {HTMLElement | null} */
+  #clicked = null;
   #trail = h("nav", { class: "file-trail", "aria-label": "Folder" });
   #note = h("p", { class: "soft small", role: "status" });
 
@@ -108,8 +110,13 @@ class FileBrowser {
     const element = fileRow(entry);
     const pick = () => this.#pick(element, entry.path);
     const open = () => this.#open(element, entry);
-    element.addEventListener("click", entry.is_dir ? open : pick);
-    element.addEventListener("dblclick", () => !entry.is_dir && open());
+    // The second click of a double click may meet the list of the folder that the first one opened.
+    const isOwn = (/** @type {MouseEvent} */ event) => {
+      if (event.detail <= 1) this.#clicked = element;
+      return this.#clicked === element;
+    };
+    element.addEventListener("click", (event) => isOwn(event) && (entry.is_dir ? open : pick)());
+    element.addEventListener("dblclick", (event) => isOwn(event) && !entry.is_dir && open());
     element.addEventListener("keydown", (event) => onRowKey(event, element, open));
     return element;
   }

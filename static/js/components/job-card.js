@@ -37,7 +37,10 @@ export function jobCard({ unit = "" } = {}) {
   cancel.addEventListener("click", () => {
     if (shown === null) return;
     cancel.disabled = true;
-    remove(`jobs/${shown.id}`).catch(toastError);
+    remove(`jobs/${shown.id}`).catch((error) => {
+      cancel.disabled = false;
+      toastError(error);
+    });
   });
   fill(element, h("div", { class: "job-head" }, stage, numbers, cancel), bar);
   return {
