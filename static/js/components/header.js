@@ -62,7 +62,8 @@ export function projectsHeader(...actions) {
 export function projectHeader(store, step, events) {
   const title = STEPS.find((entry) => entry.step === step)?.name ?? "";
   const name = h("span", { class: "project-name" });
-  const steps = h("nav", { class: "steps", "aria-label": "Steps" });
+  const links = STEPS.map((entry) => stepLink(store.id, entry.step, entry.step === step));
+  const steps = h("nav", { class: "steps", "aria-label": "Steps" }, links);
   const saved = h("span", { class: "save-state", role: "status" });
   const undo = actionButton("undo", "Undo", () => store.undo().catch(toastError));
   const redo = actionButton("redo", "Redo", () => store.redo().catch(toastError));
@@ -82,12 +83,7 @@ export function projectHeader(store, step, events) {
     name.textContent = store.project.name;
     name.title = store.project.name;
     document.title = `${title} · ${store.project.name} · Rooftrack`;
-    const { scrollLeft } = steps;
-    fill(
-      steps,
-      STEPS.map((entry, i) => stepLink(state.id, entry, i + 1, stateOf(entry.step), entry.step === step)),
-    );
-    steps.scrollLeft = scrollLeft;
+    STEPS.forEach((entry, i) => showStep(links[i], entry.name, i + 1, stateOf(entry.step)));
     setAction(undo, state.can_undo, `Undo${state.undo_label ? `: ${state.undo_label}` : ""} (Ctrl+Z)`);
     setAction(redo, state.can_redo, `Redo${state.redo_label ? `: ${state.redo_label}` : ""} (Ctrl+Shift+Z)`);
   };
@@ -147,21 +143,19 @@ export function statusMark(status, number = "") {
   return h("span", { class: `status ${status}` }, status === "todo" ? number : icon(STATUS_ICONS[status]));
 }
 
-/** @param {string} id @param {{step: StepName, name: string}} entry @param {number} number @param {{status: StepStatus, message: string} | undefined} state @param {boolean} current */
-function stepLink(id, entry, number, state, current) {
+/** A link to a step, empty until `showStep`. @param {string} id @param {StepName} step @param {boolean} current */
+const stepLink = (id, step, current) =>
+  h("a", { href: stepUrl(id, step), "aria-current": current ? "page" : null, "data-step": step });
+
+/** @param {HTMLAnchorElement} link @param {string} name @param {number} number @param {{status: StepStatus, message: string} | undefined} state */
+function showStep(link, name, number, state) {
   const status = state?.status ?? "todo";
-  const words = `${entry.name}: ${STATUS_WORDS[status]}${state?.message ? `. ${told(state.message).words}` : ""}`;
-  return h(
-    "a",
-    {
-      href: stepUrl(id, entry.step),
-      "aria-current": current ? "page" : null,
-      title: words,
-      "data-step": entry.step,
-      "data-status": status,
-    },
+  link.title = `${name}: ${STATUS_WORDS[status]}${state?.message ? `. ${told(state.message).words}` : ""}`;
+  link.dataset.status = status;
+  fill(
+    link,
     statusMark(status, number),
-    h("span", { class: "name" }, entry.name),
+    h("span", { class: "name" }, name),
     h("span", { class: "visually-hidden" }, `, ${STATUS_WORDS[status]}`),
   );
 }

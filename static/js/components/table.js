@@ -1,6 +1,6 @@
 // A table one can sort, select in and move through with the arrow keys.
 
-import { fill, h } from "../lib/dom.js";
+import { decorate, fill, h, refill } from "../lib/dom.js";
 
 /**
  * @template Row
@@ -34,6 +34,8 @@ export class SortableTable {
   #selected = null;
   /** @type {{key: string, down: boolean} | null} */
   #order = null;
+  /** By id; a row stays while its figures change, so that a click begun on it ends on it. @type {Map<string, HTMLTableRowElement>} */
+  #shown = new Map();
   #head = h("tr");
   #body = h("tbody");
 
@@ -59,8 +61,8 @@ export class SortableTable {
   /** @param {string | null} key */
   select(key) {
     this.#selected = key;
-    for (const row of this.#body.querySelectorAll("tr[data-id]")) {
-      const on = /** @type {HTMLElement} */ (row).dataset.id === key;
+    for (const [id, row] of this.#shown) {
+      const on = id === key;
       row.setAttribute("aria-selected", String(on));
       if (on) row.scrollIntoView({ block: "nearest" });
     }
@@ -84,39 +86,44 @@ export class SortableTable {
   #show() {
     const { columns, empty = "Nothing yet." } = this.options;
     const focused = this.#body.contains(document.activeElement) ? keyOf(document.activeElement) : null;
-    fill(
+    refill(
       this.#head,
       columns.map((column) => heading(column, this.#order, (key) => this.#turn(key))),
     );
-    if (this.#rows.length === 0)
+    const rows = this.#sorted().map((row) => this.#tableRow(row));
+    this.#shown = new Map(rows.map((row) => [row.dataset.id ?? "", row]));
+    if (rows.length === 0)
       fill(this.#body, h("tr", { class: "empty" }, h("td", { colspan: columns.length }, empty)));
-    else
-      fill(
-        this.#body,
-        this.#sorted().map((row) => this.#tableRow(row)),
-      );
-    if (focused)
-      /** @type {HTMLElement | null} */ (this.#body.querySelector(`tr[data-id="${CSS.escape(focused)}"]`))?.focus();
+    else refill(this.#body, rows);
+    if (focused) this.#shown.get(focused)?.focus();
   }
 
   /** @param {Row} row */
   #tableRow(row) {
-    const { columns, id, rowClass, onSelect, onOpen } = this.options;
+    const { columns, id, rowClass } = this.options;
     const key = id(row);
-    return h(
+    const element = this.#shown.get(key) ?? this.#emptyRow(key);
+    decorate(element, { class: rowClass?.(row) ?? "", "aria-selected": String(key === this.#selected) });
+    columns.forEach((column, i) => {
+      element.cells[i].className = `${column.number ? "number" : ""} ${column.tone?.(row) ?? ""}`;
+      refill(element.cells[i], column.cell(row));
+    });
+    return element;
+  }
+
+  /** @param {string} key */
+  #emptyRow(key) {
+    const { columns, onSelect, onOpen } = this.options;
+    const run = (/** @type {((row: Row) => void) | undefined} */ act) => {
+      const row = this.#rowOf(element);
+      if (row) act?.(row);
+    };
+    const element = h(
       "tr",
-      {
-        "data-id": key,
-        tabindex: 0,
-        class: rowClass?.(row) ?? "",
-        "aria-selected": key === this.#selected ? "true" : "false",
-        onclick: () => onSelect?.(row),
-        ondblclick: () => onOpen?.(row),
-      },
-      columns.map((column) =>
-        h("td", { class: `${column.number ? "number" : ""} ${column.tone?.(row) ?? ""}` }, column.cell(row)),
-      ),
+      { "data-id": key, tabindex: 0, onclick: () => run(onSelect), ondblclick: () => run(onOpen) },
+      columns.map(() => h("td")),
     );
+    return element;
   }
 
   /** @param {KeyboardEvent} event */

@@ -51,6 +51,19 @@ export function fill(element, ...children) {
 }
 
 /**
+ * Replace everything inside if it changes by that. A press and its release are a click only on what has stayed, and the
+ * press itself may bring news: it takes the focus out of a field whose number is then saved.
+ * @param {Element} element
+ * @param {...(Child | Child[])} children
+ */
+export function refill(element, ...children) {
+  const wanted = nodes(children).map((node) => (node instanceof Node ? node : new Text(node)));
+  const present = element.childNodes;
+  const isThere = wanted.length === present.length && wanted.every((node, i) => node.isEqualNode(present[i]));
+  if (!isThere) element.replaceChildren(...wanted);
+}
+
+/**
  * The element a page must have; its absence is our mistake, so it throws.
  * @template {Element} [Kind=HTMLElement]
  * @param {string} selector

@@ -1,0 +1,108 @@
+"""A hand is quicker than a server: what was pressed or asked before its answer came is neither lost nor mistaken."""
+
+from __future__ import annotations
+
+import re
+
+from playwright.sync_api import Locator, Page, expect
+
+from core.project import read_project
+from tests.browser.live import SAMPLE, arrived, hold_first, watched
+from tests.browser.steps import ready, saved
+
+
+def press_and_release_late(page: Page, element: Locator, news: Locator) -> None:
+    """Press the mouse on an element, and let go once the news that this brings are shown."""
+    box = element.bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    expect(news).to_be_enabled()
+    saved(page)
+    page.mouse.up()
+
+
+def test_a_step_is_gone_to_by_the_press_that_saves_a_number(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions")
+        ready(page, "Reference frame")
+        page.get_by_role("textbox", name="Height above ground").fill("18.5")
+        undo = page.get_by_role("button", name="Undo: Height of roof")
+        press_and_release_late(page, page.locator(".steps a[data-step=track]"), undo)
+        page.wait_for_url(f"{pages}/track")
+    assert read_project(folder).targets[0].height_m == 18.5
+
+
+def test_a_pair_is_picked_out_by_the_press_that_saves_a_number(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        page.locator("#pairs tbody tr[data-id='3']").click()
+        page.locator("#selection").get_by_role("textbox", name="u", exact=True).fill("700.25")
+        undo = page.get_by_role("button", name=re.compile("^Undo: .*pair 3"))
+        row = page.locator("#pairs tbody tr[data-id='5']")
+        press_and_release_late(page, row, undo)
+        expect(row).to_have_attribute("aria-selected", "true")
+    assert read_project(folder).correspondences[2].frame_px[0] == 700.25
+
+
+def test_redo_follows_undo_before_it_is_answered(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        pair = page.locator("#pairs tbody tr[data-id='3']")
+        pair.click()
+        page.keyboard.press("Delete")
+        saved(page)
+        undo = hold_first(page, "**/undo")
+        page.keyboard.press("Control+z")
+        asked = arrived(page, undo)
+        page.keyboard.press("Control+Shift+z")
+        asked.continue_()
+        expect(page.locator(".toast")).to_have_text("Redone: “Delete pair 3”")
+        expect(pair).to_have_count(0)
+    assert [pair.id for pair in read_project(folder).correspondences] == [1, 2, *range(4, 21)]
+
+
+JOB_SHOWN = """async () => {
+    const card = (await import("/static/js/components/job-card.js")).jobCard();
+    card.show({ id: "gone", kind: "cloud", state: "running", stage: "cloud", message: "", done: 1, total: 2 });
+    document.body.append(card.element);
+}"""
+
+
+def test_what_could_not_be_cancelled_can_be_cancelled_again(browser, project):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/inputs")
+        page.evaluate(JOB_SHOWN)
+        cancel = page.locator(".job").get_by_role("button", name="Cancel")
+        cancel.click()
+        expect(page.get_by_role("alert")).to_have_count(1)
+        expect(cancel).to_be_enabled()
+
+
+def test_a_double_click_on_a_folder_takes_no_file_in_it(browser, project):
+    folder, pages = project
+    (folder / "a").mkdir()
+    (folder / "a" / "lens.yaml").write_text((SAMPLE / "lens.yaml").read_text())
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/inputs")
+        page.locator(".input-card[data-kind=lens]").get_by_role("button", name="Choose on this computer").click()
+        path = page.get_by_label("Path of a file or folder")
+        path.fill(str(folder))
+        path.press("Enter")
+        inner, file = page.locator("[data-path$='/a']"), page.get_by_role("option", name="lens.yaml")
+        box = inner.bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        for clicks in (1, 2):
+            page.mouse.down(click_count=clicks)
+            page.mouse.up(click_count=clicks)
+            expect(file).to_be_visible()
+        expect(file).to_have_attribute("aria-selected", "false")
+        file.dblclick()
+        expect(page.get_by_role("dialog")).to_have_count(0)
+        saved(page)
+    assert read_project(folder).inputs.lens == "a/lens.yaml"
