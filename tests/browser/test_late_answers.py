@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 from playwright.sync_api import Locator, Page, expect
@@ -31,6 +32,20 @@ def test_a_step_is_gone_to_by_the_press_that_saves_a_number(browser, project):
         press_and_release_late(page, page.locator(".steps a[data-step=track]"), undo)
         page.wait_for_url(f"{pages}/track")
     assert read_project(folder).targets[0].height_m == 18.5
+
+
+def test_a_target_is_chosen_by_the_press_that_saves_a_number(browser, project):
+    folder, pages = project
+    document = json.loads((folder / "project.json").read_text())
+    roof = document["targets"][0]
+    (folder / "project.json").write_text(json.dumps(document | {"targets": [roof, roof | {"name": "table"}]}))
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions")
+        ready(page, "Reference frame")
+        page.get_by_role("textbox", name="Height above ground").fill("18.5")
+        table = page.locator("[data-target=table]")
+        press_and_release_late(page, table, page.get_by_role("button", name="Undo: Height of roof"))
+        expect(table).to_have_attribute("aria-selected", "true")
 
 
 def test_a_pair_is_picked_out_by_the_press_that_saves_a_number(browser, project):
@@ -64,6 +79,18 @@ def test_redo_follows_undo_before_it_is_answered(browser, project):
         expect(page.locator(".toast")).to_have_text("Redone: “Delete pair 3”")
         expect(pair).to_have_count(0)
     assert [pair.id for pair in read_project(folder).correspondences] == [1, 2, *range(4, 21)]
+
+
+def test_review_begins_where_its_address_says_whatever_is_pressed_before(browser, measured):
+    _, pages = measured
+    with watched(browser, pages) as page:
+        history = hold_first(page, "**/results/roof*")
+        page.goto(f"{pages}/review?frame=40")
+        asked = arrived(page, history)
+        page.keyboard.press("ArrowRight")
+        page.wait_for_url("**/review?frame=0")  # nothing is known of other frames yet
+        asked.continue_()
+        expect(page.locator(".player-readout")).to_contain_text("frame 40 /")
 
 
 JOB_SHOWN = """async () => {

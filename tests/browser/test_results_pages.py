@@ -63,7 +63,11 @@ def test_tracking_is_cancelled_survives_the_server_and_ends_as_the_headless_engi
             "**/track",
             lambda route: route.continue_() if released or route.request.method != "GET" else held.append(route),
         )
-        page.get_by_role("button", name="Cancel").click()
+        page.get_by_role("button", name="Cancel").hover()
+        before = page.locator(".figures .value").first.inner_text()
+        page.mouse.down()
+        expect(page.locator(".figures .value").first).not_to_have_text(before)  # a slow hand, and news come meanwhile
+        page.mouse.up()
         expect(page.get_by_text("Reading what was kept…")).to_be_visible()
         expect(page.get_by_role("button", name="Start")).to_have_count(0)
         page.keyboard.press("r")  # what would be started is not known yet

@@ -1,6 +1,6 @@
 // Frame ranges a person rejects: selected on a plot or by keys, listed, taken back.
 
-import { fill, h } from "../lib/dom.js";
+import { fill, h, refill } from "../lib/dom.js";
 import { icon } from "../lib/icons.js";
 import { fixed, plural } from "../lib/format.js";
 import { numberField } from "./number-field.js";
@@ -134,7 +134,7 @@ export class ExclusionEditor {
 
   show() {
     const ranges = this.store.project.excluded_frames;
-    fill(
+    refill(
       this.list,
       ranges.map((range) => this.#row(range)),
     );

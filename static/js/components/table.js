@@ -1,6 +1,6 @@
 // A table one can sort, select in and move through with the arrow keys.
 
-import { decorate, fill, h, refill } from "../lib/dom.js";
+import { decorate, h, refill } from "../lib/dom.js";
 
 /**
  * @template Row
@@ -92,9 +92,8 @@ export class SortableTable {
     );
     const rows = this.#sorted().map((row) => this.#tableRow(row));
     this.#shown = new Map(rows.map((row) => [row.dataset.id ?? "", row]));
-    if (rows.length === 0)
-      fill(this.#body, h("tr", { class: "empty" }, h("td", { colspan: columns.length }, empty)));
-    else refill(this.#body, rows);
+    const none = () => h("tr", { class: "empty" }, h("td", { colspan: columns.length }, empty));
+    refill(this.#body, rows.length === 0 ? none() : rows);
     if (focused) this.#shown.get(focused)?.focus();
   }
 

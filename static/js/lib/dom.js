@@ -51,16 +51,22 @@ export function fill(element, ...children) {
 }
 
 /**
- * Replace everything inside if it changes by that. A press and its release are a click only on what has stayed, and the
- * press itself may bring news: it takes the focus out of a field whose number is then saved.
+ * Replace what changes inside. A press and its release are a click only on what has stayed meanwhile, and so does the
+ * focus; the press itself may bring news, since it takes the focus out of a field whose number is then saved.
+ * What looks the same must do the same: it stays with the listeners it has.
  * @param {Element} element
  * @param {...(Child | Child[])} children
  */
 export function refill(element, ...children) {
-  const wanted = nodes(children).map((node) => (node instanceof Node ? node : new Text(node)));
-  const present = element.childNodes;
-  const isThere = wanted.length === present.length && wanted.every((node, i) => node.isEqualNode(present[i]));
-  if (!isThere) element.replaceChildren(...wanted);
+  const present = [...element.childNodes];
+  const wanted = nodes(children)
+    .map((child) => (child instanceof Node ? child : new Text(child)))
+    .map((node, i) => (node.isEqualNode(present[i] ?? null) ? present[i] : node));
+  for (const node of present) if (!wanted.includes(node)) node.remove();
+  wanted.forEach((node, i) => {
+    const there = element.childNodes[i] ?? null;
+    if (there !== node) element.insertBefore(node, there);
+  });
 }
 
 /**

@@ -55,6 +55,8 @@ let stage = STAGES.find((entry) => entry.value === viewText("view"))?.value ?? "
 /** @type {Set<Layer>} */
 const layers = new Set(LAYERS.map((entry) => entry.layer));
 for (const layer of (viewText("hidden") ?? "").split(",")) layers.delete(/** @type {Layer} */ (layer));
+/** The frame to begin with: keys may lead to others before any can be shown, and change the address. */
+const firstFrame = viewNumber("frame", store.project.reference_frame);
 /** Histories by "method/target". @type {Map<string, History>} */
 const histories = new Map();
 
@@ -145,7 +147,7 @@ chooseStage(stage);
 const opened = busyOver(stageBody, "Solving…");
 await loadHistories().catch(toastError);
 opened();
-player.go(viewNumber("frame", store.project.reference_frame));
+player.go(firstFrame);
 
 function listen() {
   player.on("frame", onFrame);

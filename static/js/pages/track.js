@@ -1,7 +1,7 @@
 // Track: measure every frame, and watch the history grow.
 
 import { get, post, projectPath, remove, sentence } from "../lib/api.js";
-import { fill, find, h } from "../lib/dom.js";
+import { fill, find, h, refill } from "../lib/dom.js";
 import { count, duration, fixed, millimetres, pixels, plural } from "../lib/format.js";
 import { icon } from "../lib/icons.js";
 import { told } from "../lib/problems.js";
@@ -309,13 +309,13 @@ function showControls() {
     done && job?.state !== "failed" ? note("good", doneWords()) : null,
     ...(done ? (results?.summary?.warnings ?? []) : []).map((/** @type {string} */ warning) => note("warn", told(warning).words)),
   ];
-  fill(controls, h("header", {}, h("h2", {}, "Measurement")), notes, buttons(Boolean(done)));
+  refill(controls, h("header", {}, h("h2", {}, "Measurement")), notes, buttons(Boolean(done)));
 }
 
 /** A job has ended: what it kept, and so what can be done next, is being asked for. */
 function showReading() {
   const words = track.job?.state === "done" ? "Reading the result…" : "Reading what was kept…";
-  fill(controls, h("header", {}, h("h2", {}, "Measurement")), h("p", { class: "soft", role: "status" }, words));
+  refill(controls, h("header", {}, h("h2", {}, "Measurement")), h("p", { class: "soft", role: "status" }, words));
 }
 
 /** Why the last measurement failed, as its job says or, after a restart, the step; empty where it did not. */
@@ -371,7 +371,7 @@ function showRunning(job) {
     icon("close"),
     "Cancel",
   );
-  fill(
+  refill(
     controls,
     h(
       "header",
@@ -423,7 +423,7 @@ function showMethods() {
   fill(find("header", HTMLElement, methods), h("h2", {}, "Method"), filterBadge(store));
   const box = find(".choices", HTMLElement, methods);
   const focused = box.contains(document.activeElement);
-  fill(
+  refill(
     box,
     METHODS.map((method) => {
       const on = store.project.method === method.value;

@@ -1,6 +1,6 @@
 // The outlines of what moves, as a list.
 
-import { fill, h } from "../../lib/dom.js";
+import { fill, h, refill } from "../../lib/dom.js";
 import { plural } from "../../lib/format.js";
 import { icon } from "../../lib/icons.js";
 
@@ -30,6 +30,6 @@ export function movingPanel(element, { onSelect, onRemove }) {
   /** @param {Point[][]} regions @param {number | null} selected */
   return function show(regions, selected) {
     const rows = regions.map((corners, index) => row(corners, index, index === selected));
-    fill(list, rows.length === 0 ? h("li", { class: "none" }, ADVICE) : rows);
+    refill(list, rows.length === 0 ? h("li", { class: "none" }, ADVICE) : rows);
   };
 }

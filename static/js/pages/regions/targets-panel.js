@@ -1,6 +1,6 @@
 // What is measured: the list of targets, and the settings of the chosen one.
 
-import { fill, h } from "../../lib/dom.js";
+import { fill, h, refill } from "../../lib/dom.js";
 import { icon } from "../../lib/icons.js";
 import { metres } from "../../lib/format.js";
 import { TARGET_NAME, isComplete } from "../../lib/targets.js";
@@ -28,7 +28,7 @@ export function targetsPanel(element, targets, camera_m) {
   return function show() {
     const { all, selected } = targets;
     const rows = all.map((target) => row(targets, target, target.name === selected?.name));
-    fill(list, rows.length === 0 ? noTargets() : rows);
+    refill(list, rows.length === 0 ? noTargets() : rows);
     settings.show();
   };
 }
