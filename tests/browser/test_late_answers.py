@@ -62,6 +62,28 @@ def test_a_pair_is_picked_out_by_the_press_that_saves_a_number(browser, project)
     assert read_project(folder).correspondences[2].frame_px[0] == 700.25
 
 
+CHOICES_SHOWN = """async () => {
+    const choices = ["a", "b"].map((value) => ({ value, name: value }));
+    const { segmented } = await import("/static/js/components/segmented.js");
+    window.row = segmented({ label: "Row", choices, value: "a", onChange: (value) => (window.chosen = value) });
+    window.again = () => window.row.offer(choices);
+    document.querySelector("#main").prepend(window.row.element);
+}"""
+
+
+def test_a_choice_is_made_though_it_is_offered_again_meanwhile(browser, project):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions")
+        ready(page, "Reference frame")
+        page.evaluate(CHOICES_SHOWN)
+        page.get_by_role("radiogroup", name="Row").get_by_role("radio", name="b").hover()
+        page.mouse.down()
+        page.evaluate("window.again()")  # as each frame does that is measured
+        page.mouse.up()
+        assert page.evaluate("window.chosen") == "b"
+
+
 def test_redo_follows_undo_before_it_is_answered(browser, project):
     folder, pages = project
     with watched(browser, pages) as page:

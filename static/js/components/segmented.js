@@ -1,6 +1,6 @@
 // A row of choices of which one holds. Arrow keys move between them, as between radio buttons.
 
-import { fill, h } from "../lib/dom.js";
+import { h, refill } from "../lib/dom.js";
 
 /**
  * @template {string} Value
@@ -22,7 +22,7 @@ export function segmented({ label, choices, value, onChange }) {
   };
   const show = () => {
     const hadFocus = element.contains(document.activeElement);
-    fill(
+    refill(
       element,
       offered.map((choice) => {
         const on = choice.value === chosen;
