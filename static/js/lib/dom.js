@@ -51,9 +51,9 @@ export function fill(element, ...children) {
 }
 
 /**
- * Replace what changes inside. A press and its release are a click only on what has stayed meanwhile, and so does the
- * focus; the press itself may bring news, since it takes the focus out of a field whose number is then saved.
- * What looks the same must do the same: it stays with the listeners it has.
+ * Replace what changes inside. What looks the same stays, with its focus and its listeners: it must do the same, too.
+ * A press and its release are a click only on what has stayed, and the press itself may bring news: it takes the focus
+ * out of a field whose number is then saved.
  * @param {Element} element
  * @param {...(Child | Child[])} children
  */
