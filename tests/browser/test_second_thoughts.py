@@ -410,3 +410,16 @@ def test_a_click_beside_a_dialog_throws_away_nothing_that_was_entered(browser, p
         expect(page.get_by_role("dialog")).to_be_visible()
         page.mouse.click(5, 5)  # nothing to lose in a list of keys
         expect(page.get_by_role("dialog")).to_have_count(0)
+
+
+def test_the_page_of_a_deleted_project_offers_to_restore_it(browser, project):
+    folder, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/regions")
+        ready(page, "Reference frame")
+        page.evaluate(f"""async () => (await import("/static/js/lib/api.js")).remove("projects/{folder.name}")""")
+        page.reload()
+        expect(page.locator("#main")).to_contain_text("there is no such project")
+        page.get_by_role("button", name="Restore the deleted project").click()
+        ready(page, "Reference frame")
+    assert (folder / "project.json").exists()

@@ -18,9 +18,9 @@ import { ProjectStore } from "../lib/store.js";
 import { ServerEventStream } from "../lib/events.js";
 import { bindKeys } from "../lib/keys.js";
 import { fill, find, h } from "../lib/dom.js";
-import { isConflict, sentence } from "../lib/api.js";
+import { ApiError, get, isConflict, post, sentence } from "../lib/api.js";
 import { plural } from "../lib/format.js";
-import { projectHeader, projectsHeader, tellConnection } from "./header.js";
+import { projectHeader, projectsHeader, stepUrl, tellConnection } from "./header.js";
 import { toast, toastError } from "./toast.js";
 
 /** @typedef {import("../lib/types.js").StepName} StepName */
@@ -44,7 +44,8 @@ export async function openPage(step) {
     bindKeys(historyKeys(store));
     return { id, step, store, events, keys: bindKeys };
   } catch (error) {
-    showDeadEnd(sentence(error));
+    const isThere = !(error instanceof ApiError && error.status === 404);
+    showDeadEnd(sentence(error), isThere ? null : await restoring(id, step));
     return new Promise(() => undefined); // the page goes no further
   }
 }
@@ -99,15 +100,28 @@ const whyLost = (error) =>
     ? ": another window has changed this project. You now see its newer state."
     : `. ${sentence(error)}`;
 
-/** @param {string} message */
-function showDeadEnd(message) {
+/** A button that fetches a deleted project back, to the step that was asked for; null where none of this id is kept. @param {string} id @param {StepName} step */
+async function restoring(id, step) {
+  const kept = await get("trash").catch(() => []);
+  const deleted = kept.find((/** @type {{id: string}} */ project) => project.id === id);
+  if (deleted === undefined) return null;
+  const restore = async () => {
+    const restored = await post("projects/untrash", { undo_token: deleted.undo_token });
+    location.assign(stepUrl(restored.id, step));
+  };
+  const onclick = () => restore().catch(toastError);
+  return h("button", { class: "button", type: "button", onclick }, "Restore the deleted project");
+}
+
+/** @param {string} message @param {HTMLElement | null} remedy */
+function showDeadEnd(message, remedy) {
   projectsHeader();
   const box = h(
     "div",
     { class: "empty-state" },
     h("h1", {}, "This project cannot be opened"),
     h("p", {}, message),
-    h("a", { class: "button primary", href: "/" }, "All projects"),
+    h("div", { class: "toolbar" }, remedy, h("a", { class: "button primary", href: "/" }, "All projects")),
   );
   const main = find("#main");
   main.className = "page";
