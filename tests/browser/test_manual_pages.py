@@ -206,12 +206,15 @@ def test_edits_wait_in_the_window_for_a_server_that_does_not_answer(browser, pro
         figures = page.locator("#fit .figures")
         expect(figures).to_contain_class("awaited")  # they are of the pairs before
         expect(figures).to_contain_text("18 / 20")
+        arrow = pane(page, "Reference frame").locator(".shapes .residual").first
+        expect(arrow).to_have_css("opacity", "0.4")
         to_step(page, "Regions")
         assert arrived(page, asked) == "beforeunload"
         page.context.set_offline(False)
         saved(page)
         expect(page.get_by_text("The server does not answer – trying again")).to_be_hidden()
         expect(figures).not_to_contain_class("awaited")
+        expect(arrow).to_have_css("opacity", "1")
         expect(figures).to_contain_text("18 / 20")
     assert [pair.id for pair in read_project(folder).correspondences if not pair.enabled] == [4, 5]
 

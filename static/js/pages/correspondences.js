@@ -137,6 +137,7 @@ function showNumbers() {
   const enabled = pairs.filter((pair) => pair.enabled).length;
   showFitFigures(fit, { enabled, total: pairs.length, awaited: fitAwaited.shown });
   table.show(pairs, fit, fitAwaited.shown);
+  for (const { pane } of sides) pane.element.classList.toggle("fit-awaited", fitAwaited.shown);
 }
 
 function showFit() {
