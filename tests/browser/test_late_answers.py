@@ -133,14 +133,41 @@ def test_what_could_not_be_cancelled_can_be_cancelled_again(browser, project):
         expect(cancel).to_be_enabled()
 
 
+def choose_lens(page: Page, pages: str) -> Locator:
+    """Open the dialog that chooses a lens; return the field for its path."""
+    page.goto(f"{pages}/inputs")
+    page.locator(".input-card[data-kind=lens]").get_by_role("button", name="Choose on this computer").click()
+    return page.get_by_label("Path of a file or folder")
+
+
+def test_of_two_folders_the_one_asked_for_last_is_shown(browser, project):
+    folder, pages = project
+    for name in ("slow", "quick"):
+        (folder / name).mkdir()
+        (folder / name / f"{name}.yaml").write_text((SAMPLE / "lens.yaml").read_text())
+    with watched(browser, pages) as page:
+        held = hold_first(page, "**/browse*slow")
+        path = choose_lens(page, pages)
+        path.fill(str(folder / "slow"))
+        path.press("Enter")
+        asked = arrived(page, held)
+        path.fill(str(folder / "quick"))
+        path.press("Enter")
+        quick = page.get_by_role("option", name="quick.yaml")
+        expect(quick).to_be_visible()
+        with page.expect_response("**/browse*slow"):
+            asked.continue_()
+        page.evaluate("new Promise(requestAnimationFrame)")
+        expect(quick).to_be_visible()
+        expect(path).to_have_value(str(folder / "quick"))
+
+
 def test_a_double_click_on_a_folder_takes_no_file_in_it(browser, project):
     folder, pages = project
     (folder / "a").mkdir()
     (folder / "a" / "lens.yaml").write_text((SAMPLE / "lens.yaml").read_text())
     with watched(browser, pages) as page:
-        page.goto(f"{pages}/inputs")
-        page.locator(".input-card[data-kind=lens]").get_by_role("button", name="Choose on this computer").click()
-        path = page.get_by_label("Path of a file or folder")
+        path = choose_lens(page, pages)
         path.fill(str(folder))
         path.press("Enter")
         inner, file = page.locator("[data-path$='/a']"), page.get_by_role("option", name="lens.yaml")

@@ -42,6 +42,8 @@ class FileBrowser {
   #chosen = new Set();
   /** The row that the last single click or the first one of a double click met. @type {HTMLElement | null} */
   #clicked = null;
+  /** How many folders were asked for: only what is asked last is shown, whenever it is answered. */
+  #asked = 0;
   #trail = h("nav", { class: "file-trail", "aria-label": "Folder" });
   #note = h("p", { class: "soft small", role: "status" });
 
@@ -66,12 +68,15 @@ class FileBrowser {
 
   /** Show a folder; null is where the server begins. @param {string | null} dir @returns {Promise<void>} */
   async go(dir) {
+    const turn = (this.#asked += 1);
     this.#chosen.clear();
     this.button.disabled = true;
     try {
       const where = dir === null ? "" : `&dir=${encodeURIComponent(dir)}`;
-      this.#show(/** @type {Listing} */ (await get(`browse?kind=${this.kind}${where}`)));
+      const listing = /** @type {Listing} */ (await get(`browse?kind=${this.kind}${where}`));
+      if (turn === this.#asked) this.#show(listing);
     } catch (error) {
+      if (turn !== this.#asked) return;
       if (dir !== null && this.list.children.length === 0) return this.go(null); // the folder of last time may be gone
       this.#note.textContent = sentence(error);
     }
