@@ -45,6 +45,12 @@ def pane(page: Page, name: str) -> Locator:
     return page.get_by_role("application", name=re.compile(f"^{name}"))
 
 
+def choose_lens(page: Page) -> Locator:
+    """Open the dialog that chooses a lens on this computer; return the field for its path."""
+    page.locator(".input-card[data-kind=lens]").get_by_role("button", name="Choose on this computer").click()
+    return page.get_by_label("Path of a file or folder")
+
+
 def ready(page: Page, name: str) -> None:
     """Wait until a pane shows its picture."""
     expect(pane(page, name)).to_have_attribute("data-picture", re.compile(r"\d+x\d+"), timeout=20_000)

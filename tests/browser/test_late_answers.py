@@ -9,7 +9,7 @@ from playwright.sync_api import Locator, Page, expect
 
 from core.project import read_project
 from tests.browser.live import SAMPLE, arrived, hold_first, watched
-from tests.browser.steps import ready, saved
+from tests.browser.steps import choose_lens, ready, saved
 
 
 def press_and_release_late(page: Page, element: Locator, news: Locator) -> None:
@@ -133,13 +133,6 @@ def test_what_could_not_be_cancelled_can_be_cancelled_again(browser, project):
         expect(cancel).to_be_enabled()
 
 
-def choose_lens(page: Page, pages: str) -> Locator:
-    """Open the dialog that chooses a lens; return the field for its path."""
-    page.goto(f"{pages}/inputs")
-    page.locator(".input-card[data-kind=lens]").get_by_role("button", name="Choose on this computer").click()
-    return page.get_by_label("Path of a file or folder")
-
-
 def test_of_two_folders_the_one_asked_for_last_is_shown(browser, project):
     folder, pages = project
     for name in ("slow", "quick"):
@@ -147,7 +140,8 @@ def test_of_two_folders_the_one_asked_for_last_is_shown(browser, project):
         (folder / name / f"{name}.yaml").write_text((SAMPLE / "lens.yaml").read_text())
     with watched(browser, pages) as page:
         held = hold_first(page, "**/browse*slow")
-        path = choose_lens(page, pages)
+        page.goto(f"{pages}/inputs")
+        path = choose_lens(page)
         path.fill(str(folder / "slow"))
         path.press("Enter")
         asked = arrived(page, held)
@@ -167,7 +161,8 @@ def test_a_double_click_on_a_folder_takes_no_file_in_it(browser, project):
     (folder / "a").mkdir()
     (folder / "a" / "lens.yaml").write_text((SAMPLE / "lens.yaml").read_text())
     with watched(browser, pages) as page:
-        path = choose_lens(page, pages)
+        page.goto(f"{pages}/inputs")
+        path = choose_lens(page)
         path.fill(str(folder))
         path.press("Enter")
         inner, file = page.locator("[data-path$='/a']"), page.get_by_role("option", name="lens.yaml")

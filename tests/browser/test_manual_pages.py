@@ -30,6 +30,7 @@ from tests.browser.live import (
 )
 from tests.browser.steps import (
     FRAME_SIZE,
+    choose_lens,
     draw_bands,
     make_orthoimage,
     ortho_px,
@@ -707,8 +708,7 @@ def test_a_file_is_chosen_by_typing_its_path(browser, project):
         page.goto(f"{pages}/inputs")
         lens = page.locator(".input-card[data-kind=lens]")
         (folder / "again.yaml").write_text((SAMPLE / "lens.yaml").read_text())
-        lens.get_by_role("button", name="Choose on this computer").click()
-        path = page.get_by_label("Path of a file or folder")
+        path = choose_lens(page)
         expect(path).to_have_value(re.compile("^/"))
         path.fill(str(folder / "none.yaml"))
         path.press("Enter")
@@ -717,7 +717,7 @@ def test_a_file_is_chosen_by_typing_its_path(browser, project):
         path.fill(str(folder / "wrong.yaml"))
         path.press("Enter")
         expect(lens.locator(".refusal")).to_contain_text("wrong.yaml")
-        lens.get_by_role("button", name="Choose on this computer").click()
+        choose_lens(page)
         path.fill(str(folder))
         path.press("Enter")
         expect(page.get_by_role("option", name="again.yaml")).to_be_visible()

@@ -116,12 +116,11 @@ class FileBrowser {
     const pick = () => this.#pick(element, entry.path);
     const open = () => this.#open(element, entry);
     // The second click of a double click may meet the list of the folder that the first one opened.
-    const isOwn = (/** @type {MouseEvent} */ event) => {
+    element.addEventListener("click", (event) => {
       if (event.detail <= 1) this.#clicked = element;
-      return this.#clicked === element;
-    };
-    element.addEventListener("click", (event) => isOwn(event) && (entry.is_dir ? open : pick)());
-    element.addEventListener("dblclick", (event) => isOwn(event) && !entry.is_dir && open());
+      if (this.#clicked === element) (entry.is_dir ? open : pick)();
+    });
+    element.addEventListener("dblclick", () => this.#clicked === element && !entry.is_dir && open());
     element.addEventListener("keydown", (event) => onRowKey(event, element, open));
     return element;
   }

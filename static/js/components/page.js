@@ -18,8 +18,9 @@ import { ProjectStore } from "../lib/store.js";
 import { ServerEventStream } from "../lib/events.js";
 import { bindKeys } from "../lib/keys.js";
 import { fill, find, h } from "../lib/dom.js";
-import { ApiError, get, isConflict, post, sentence } from "../lib/api.js";
+import { isConflict, isMissing, sentence } from "../lib/api.js";
 import { plural } from "../lib/format.js";
+import { deletedProjects, undelete } from "../lib/trash.js";
 import { projectHeader, projectsHeader, stepUrl, tellConnection } from "./header.js";
 import { toast, toastError } from "./toast.js";
 
@@ -44,8 +45,7 @@ export async function openPage(step) {
     bindKeys(historyKeys(store));
     return { id, step, store, events, keys: bindKeys };
   } catch (error) {
-    const isThere = !(error instanceof ApiError && error.status === 404);
-    showDeadEnd(sentence(error), isThere ? null : await restoring(id, step));
+    showDeadEnd(sentence(error), isMissing(error) ? await restoring(id, step) : null);
     return new Promise(() => undefined); // the page goes no further
   }
 }
@@ -102,11 +102,11 @@ const whyLost = (error) =>
 
 /** A button that fetches a deleted project back, to the step that was asked for; null where none of this id is kept. @param {string} id @param {StepName} step */
 async function restoring(id, step) {
-  const kept = await get("trash").catch(() => []);
-  const deleted = kept.find((/** @type {{id: string}} */ project) => project.id === id);
+  const kept = await deletedProjects().catch(() => []);
+  const deleted = kept.find((project) => project.id === id);
   if (deleted === undefined) return null;
   const restore = async () => {
-    const restored = await post("projects/untrash", { undo_token: deleted.undo_token });
+    const restored = await undelete(deleted.undo_token);
     location.assign(stepUrl(restored.id, step));
   };
   const onclick = () => restore().catch(toastError);

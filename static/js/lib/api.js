@@ -119,6 +119,9 @@ export const isOffline = (error) => error instanceof ApiError && error.kind === 
 /** Resolves when a server that did not answer is worth asking again. @returns {Promise<void>} */
 export const untilNextTry = () => new Promise((resolve) => setTimeout(resolve, TRIES_AGAIN_MS));
 
+/** Whether what was asked for does not exist. @param {unknown} error */
+export const isMissing = (error) => error instanceof ApiError && error.status === 404;
+
 /** Whether another tab was faster. @param {unknown} error */
 export const isConflict = (error) => error instanceof ApiError && error.status === 409;
 

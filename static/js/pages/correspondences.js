@@ -136,8 +136,8 @@ function showNumbers() {
   const pairs = store.project.correspondences;
   const enabled = pairs.filter((pair) => pair.enabled).length;
   showFitFigures(fit, { enabled, total: pairs.length, awaited: fitAwaited.shown });
-  table.show(pairs, fit, fitAwaited.shown);
-  for (const { pane } of sides) pane.element.classList.toggle("fit-awaited", fitAwaited.shown);
+  table.show(pairs, fit);
+  find("#main").classList.toggle("fit-awaited", fitAwaited.shown); // what it says stands in the table and in both pictures
 }
 
 function showFit() {

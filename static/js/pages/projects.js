@@ -8,11 +8,12 @@ import { icon } from "../lib/icons.js";
 import { bindKeys } from "../lib/keys.js";
 import { latest } from "../lib/latest.js";
 import { told } from "../lib/problems.js";
+import { deletedProjects, undelete } from "../lib/trash.js";
 import { askName } from "../components/dialog.js";
 import { STEPS, projectsHeader, statusMark, stepUrl } from "../components/header.js";
 import { menuButton } from "../components/menu.js";
 import { toast, toastError } from "../components/toast.js";
-import { chooseDeleted, deletedProjects } from "./projects/deleted-projects.js";
+import { chooseDeleted } from "./projects/deleted-projects.js";
 import { newProjectDialog } from "./projects/new-project.js";
 
 /** @typedef {import("../lib/types.js").Steps} Steps */
@@ -147,7 +148,7 @@ function actions(project) {
   });
 }
 
-/** @param {() => Promise<void>} task */
+/** @param {() => Promise<unknown>} task */
 async function attempt(task) {
   try {
     await task();
@@ -199,7 +200,7 @@ function archive(project, inputs) {
 async function removeProject(project) {
   await attempt(async () => {
     const { undo_token } = await remove(projectPath(project.id));
-    const bringBack = () => void attempt(() => post("projects/untrash", { undo_token }));
+    const bringBack = () => void attempt(() => undelete(undo_token));
     toast(`${project.name} was deleted.`, { action: { label: "Undo", run: bringBack }, seconds: 20 });
   });
 }
@@ -208,7 +209,7 @@ async function restoreDeleted() {
   const chosen = await chooseDeleted();
   if (chosen === null) return load(); // another window may have restored some
   await attempt(async () => {
-    const { id } = await post("projects/untrash", { undo_token: chosen.undo_token });
+    const { id } = await undelete(chosen.undo_token);
     tellRestored(chosen.name, id);
   });
 }

@@ -60,10 +60,9 @@ export function pairsTable(element, { onSelect, onToggle }) {
   });
   element.append(table.element);
   return {
-    /** @param {Correspondence[]} pairs @param {Fit} newest @param {boolean} awaited whether the fit is of earlier pairs */
-    show(pairs, newest, awaited) {
+    /** @param {Correspondence[]} pairs @param {Fit} newest */
+    show(pairs, newest) {
       fit = newest;
-      table.element.classList.toggle("fit-awaited", awaited);
       table.setRows(pairs);
     },
     /** @param {number | null} id */

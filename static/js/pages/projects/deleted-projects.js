@@ -1,16 +1,14 @@
 // Deleted projects are kept for a while: a list of them, to fetch one back from.
 
-import { get, sentence } from "../../lib/api.js";
+import { sentence } from "../../lib/api.js";
 import { fill, h } from "../../lib/dom.js";
 import { ago, day } from "../../lib/format.js";
 import { icon } from "../../lib/icons.js";
+import { deletedProjects } from "../../lib/trash.js";
 import { openDialog } from "../../components/dialog.js";
 import { note } from "../../components/notes.js";
 
-/** @typedef {{undo_token: string, id: string, name: string, deleted_s: number, kept_until_s: number}} Deleted */
-
-/** @returns {Promise<Deleted[]>} the last deleted first */
-export const deletedProjects = () => get("trash");
+/** @typedef {import("../../lib/trash.js").Deleted} Deleted */
 
 /** @returns {Promise<Deleted | null>} the project to fetch back */
 export function chooseDeleted() {
