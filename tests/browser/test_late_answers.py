@@ -177,3 +177,15 @@ def test_a_double_click_on_a_folder_takes_no_file_in_it(browser, project):
         expect(page.get_by_role("dialog")).to_have_count(0)
         saved(page)
     assert read_project(folder).inputs.lens == "a/lens.yaml"
+
+
+def test_a_choice_is_in_the_address_at_once(browser, project):
+    _, pages = project
+    with watched(browser, pages) as page:
+        page.goto(f"{pages}/correspondences")
+        ready(page, "Reference frame")
+        page.locator("#pairs tbody tr[data-id='3']").click()
+        page.wait_for_url(re.compile(r"pair=3\b"))
+        page.wait_for_timeout(300)  # what is chosen much sooner is one of many in quick turn
+        row = page.locator("#pairs tbody tr[data-id='5']")
+        assert "pair=5" in row.evaluate("row => (row.click(), location.search)").split("?")[1].split("&")

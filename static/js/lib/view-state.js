@@ -20,14 +20,25 @@ export function viewNumbers(name, length) {
 let waiting = {};
 let timer = 0;
 
-/** Write values to the query string (null removes), without a history entry. @param {Record<string, string | number | null>} values */
+/**
+ * Write values to the query string (null removes), without a history entry: at once, but of many in quick turn, such as
+ * while one drags, the first and the last. Browsers refuse more than some hundred changes in half a minute.
+ * @param {Record<string, string | number | null>} values
+ */
 export function setView(values) {
   waiting = { ...waiting, ...values };
+  if (timer === 0) flushView();
   window.clearTimeout(timer);
-  timer = window.setTimeout(flushView, 200); // browsers refuse more than some hundred changes in half a minute
+  timer = window.setTimeout(settle, 200);
+}
+
+function settle() {
+  timer = 0;
+  flushView();
 }
 
 function flushView() {
+  if (Object.keys(waiting).length === 0) return;
   const query = new URLSearchParams(location.search);
   for (const [name, value] of Object.entries(waiting)) {
     if (value === null || value === "") query.delete(name);
