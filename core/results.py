@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,6 +49,14 @@ CSV_HEADER = (
 )
 # A tenth of a micrometre, a nanoradian, a microsecond: a thousandth of what a frame's own noise can tell apart.
 _LENGTH_DECIMALS, _ANGLE_DECIMALS, _TIME_DECIMALS = 7, 9, 6
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """Of P1 and P2 (F, 2, 2), metres, and rotation (F,), radians; or one standard deviation of both."""
+
+    places_m: Floats
+    rotation_rad: Floats
 
 
 @dataclass(frozen=True)
@@ -111,6 +119,35 @@ class TargetHistory:
         frame.flags.writeable = status.flags.writeable = False
         object.__setattr__(self, "frame", frame)
         object.__setattr__(self, "status", status)
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        *,
+        frame: NDArray[np.int64],
+        time_s: Floats,
+        status: NDArray[np.str_],
+        value: Displacement,
+        sigma: Displacement,
+        raw: Displacement,
+    ) -> Self:
+        """Return the history of a target from its displacement, that one's standard deviation, and the raw one."""
+        return cls(
+            name=name,
+            frame=frame,
+            time_s=time_s,
+            status=status,
+            p1_m=value.places_m[:, 0],
+            p2_m=value.places_m[:, 1],
+            rotation_rad=value.rotation_rad,
+            p1_sigma_m=sigma.places_m[:, 0],
+            p2_sigma_m=sigma.places_m[:, 1],
+            rotation_sigma_rad=sigma.rotation_rad,
+            p1_raw_m=raw.places_m[:, 0],
+            p2_raw_m=raw.places_m[:, 1],
+            rotation_raw_rad=raw.rotation_rad,
+        )
 
     @property
     def measured(self) -> Bools:

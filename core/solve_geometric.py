@@ -7,7 +7,7 @@ Everything here is relative to the local origin of the reference fit, with z = 0
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 
@@ -24,13 +24,13 @@ from core.measurements import Recording
 from core.motion import RigidFit
 from core.project import Project, Target
 from core.relief import Relief
-from core.results import MEASURED, TargetHistory
+from core.results import MEASURED, Displacement, TargetHistory
 from core.roof_level import doubts, height_obstacle, refuse_if, scale_at_roof
 from core.row_times import Readout, at_frame_times, estimated_readout, ground_speed
 from core.self_calibration import SelfCalibration
 from core.solution import Ground, Solution, TargetSolution, frame_status
 from core.texture_motion import with_texture
-from core.uncertainty import GROUND_PART, LEAST_STILL, Sigma, combined_sigma, common_error, jitter, robust_jitter
+from core.uncertainty import GROUND_PART, LEAST_STILL, combined_sigma, common_error, jitter, robust_jitter
 
 # Frames from which a rolling shutter is estimated.
 READOUT_FRAMES = 150
@@ -79,19 +79,8 @@ def solve_geometric(recording: Recording, project: Project, lens: Lens, relief: 
         caught_up, used.lens, used.pose0, origin_m=reference.origin_m, relief=relief, reference_frame=frame0
     )
     flight, ground = _smoothed(caught_up, ground, used.lens)
-    targets = {
-        target.name: _solve_target(
-            recording,
-            project,
-            target,
-            used=used,
-            ground=ground,
-            flight=flight,
-            slow_m=slow_m[target.name],
-            origin_m=reference.origin_m,
-        )
-        for target in project.targets
-    }
+    scene = _Scene(recording, project, used=used, ground=ground, flight=flight, origin_m=reference.origin_m)
+    targets = {target.name: _solve_target(scene, target, slow_m[target.name]) for target in project.targets}
     return Solution(
         reference=reference,
         lens=used.lens,
@@ -221,102 +210,140 @@ def _smoothed(recording: Recording, ground: Ground, lens: Lens) -> tuple[SmoothF
 # --- targets ---------------------------------------------------------------------------------------------------------
 
 
-def _solve_target(
-    recording: Recording,
-    project: Project,
-    target: Target,
-    *,
-    used: Calibration,
-    ground: Ground,
-    flight: SmoothFlight | None,
-    slow_m: Floats,
-    origin_m: Floats,
-) -> TargetSolution:
-    z_m = used.heights_m[target.name]
-    body, points = _on_plane(recording, target, used, ground, z_m=z_m)
-    intervals = project.intervals_s
-    still, after = (during(recording.time_s, part) for part in (intervals.pre_event, intervals.residual))
+@dataclass(frozen=True)
+class _Scene:
+    """What targets are solved from, with the camera of every frame known.
+
+    Attributes:
+        used: the calibration with its corrections.
+        ground, flight: in every frame.
+        origin_m: (2,) local origin.
+    """
+
+    recording: Recording
+    project: Project
+    _: KW_ONLY
+    used: Calibration
+    ground: Ground
+    flight: SmoothFlight | None
+    origin_m: Floats
+
+    def on_plane(self, target: Target, z_m: float) -> tuple[RestBody, Floats]:
+        """Return a target at rest on the plane z, and its points (F, L, S, 2) or (F, N, 2) there, metres."""
+        body = rest_body(self.recording, target.name, lens=self.used.lens, pose0=self.used.pose0, z_m=z_m)
+        raw = midpoints(self.recording.targets_raw[target.name])
+        return body, world_points(raw, self.used.lens, self.ground.known_poses, z_m)
+
+
+def _solve_target(scene: _Scene, target: Target, slow_m: Floats) -> TargetSolution:
+    recording, ground = scene.recording, scene.ground
+    z_m = scene.used.heights_m[target.name]
+    body, points = scene.on_plane(target, z_m)
+    still = during(recording.time_s, scene.project.intervals_s.pre_event)
     fit = body.fit(points, still & ground.usable)
-    used_points = (fit.weight > 0.1).reshape(len(fit.weight), -1).sum(axis=1)
     determined = body.is_determined(fit)
-    status = frame_status(recording, project, ground, points_used=used_points, determined=determined)
-    is_measured = np.isin(status, MEASURED)
-    at_rest = still & is_measured
+    used_points = (fit.weight > 0.1).reshape(len(fit.weight), -1).sum(axis=1)
+    status = frame_status(recording, scene.project, ground, points_used=used_points, determined=determined)
+    measured = np.isin(status, MEASURED)
     whole, texture_used = with_texture(
         fit,
         recording,
         target.name,
         body=body,
         known=determined & ground.usable,
-        lens=used.lens,
-        pose0=used.pose0,
+        lens=scene.used.lens,
+        pose0=scene.used.pose0,
         poses=ground.known_poses,
         z_m=z_m,
     )
-    moved = np.stack([whole.at(place, body.centre) for place in body.places], axis=1)
-    start_m, start_rad = (
-        (moved[at_rest].mean(axis=0), whole.rotation_rad[at_rest].mean()) if at_rest.any() else (np.zeros((2, 2)), 0.0)
-    )
-    places, rotation = moved - start_m, whole.rotation_rad - start_rad
-    sigma = combined_sigma(
-        _sigma_of_points(whole, body),
-        camera_m=_camera_part(target, used, ground, flight),
-        shared_m=np.hypot(_ground_part(target, used, ground), common_error(fit.residual, recording.time_s, at_rest)),
-        slow_m=slow_m,
-        places_m=places,
-        rotation_rad=rotation,
-        still=at_rest,
-        moving=~(still | after),
-        after=after & is_measured,
-    )
-    raw_m, raw_rad = _without_parallax_correction(recording, target, used, ground)
-    history = TargetHistory(
-        name=target.name,
+    value, start_m = _from_rest(_displacement(whole, body), still & measured)
+    points_sigma = _sigma_of_points(whole, body)
+    history = TargetHistory.of(
+        target.name,
         frame=recording.frame,
         time_s=recording.time_s,
         status=status,
-        p1_m=places[:, 0],
-        p2_m=places[:, 1],
-        rotation_rad=rotation,
-        p1_sigma_m=sigma.places_m[:, 0],
-        p2_sigma_m=sigma.places_m[:, 1],
-        rotation_sigma_rad=sigma.rotation_rad,
-        p1_raw_m=raw_m[:, 0],
-        p2_raw_m=raw_m[:, 1],
-        rotation_raw_rad=raw_rad,
+        value=value,
+        sigma=_sigma(scene, target, value, fit=fit, points=points_sigma, slow_m=slow_m, measured=measured),
+        raw=_without_parallax_correction(scene, target),
     )
-    growth = np.where(np.isin(status, MEASURED), body.growth(fit), np.nan)
-    return TargetSolution(history, body.places + start_m + origin_m, growth, texture_used)
+    growth = np.where(measured, body.growth(fit), np.nan)
+    return TargetSolution(history, body.places + start_m + scene.origin_m, growth, texture_used)
 
 
-def _on_plane(
-    recording: Recording, target: Target, used: Calibration, ground: Ground, *, z_m: float
-) -> tuple[RestBody, Floats]:
-    """Return a target at rest on the plane z, and its points (F, L, S, 2) or (F, N, 2) there in every frame, metres."""
-    body = rest_body(recording, target.name, lens=used.lens, pose0=used.pose0, z_m=z_m)
-    return body, world_points(midpoints(recording.targets_raw[target.name]), used.lens, ground.known_poses, z_m)
+def _displacement(motion: RigidFit, body: RestBody) -> Displacement:
+    return Displacement(np.stack([motion.at(place, body.centre) for place in body.places], axis=1), motion.rotation_rad)
 
 
-def _without_parallax_correction(
-    recording: Recording, target: Target, used: Calibration, ground: Ground
-) -> tuple[Floats, Floats]:
-    """Return P1 and P2 (F, 2, 2), metres, and the rotation (F,) as a homography of the ground alone would show them."""
-    flat, apparent = _on_plane(recording, target, used, ground, z_m=0.0)
+def _from_rest(value: Displacement, at_rest: Bools) -> tuple[Displacement, Floats]:
+    """Return displacement since rest, and by how much P1 and P2 (2, 2) rest beside where the reference frame has them.
+
+    Of what was never measured at rest, the reference frame counts as rest.
+    """
+    if not at_rest.any():
+        return value, np.zeros((2, 2))
+    start_m, start_rad = value.places_m[at_rest].mean(axis=0), value.rotation_rad[at_rest].mean()
+    return Displacement(value.places_m - start_m, value.rotation_rad - start_rad), start_m
+
+
+def _without_parallax_correction(scene: _Scene, target: Target) -> Displacement:
+    """Return displacement as a homography of the ground alone would show it."""
+    flat, apparent = scene.on_plane(target, 0.0)
     fit = flat.fit(apparent, np.zeros(len(apparent), dtype=bool))
+    used = scene.used
     scale = scale_at_roof(target, flat.places, height_m=used.heights_m[target.name], camera=used.pose0)
-    return scale * np.stack([fit.at(place, flat.centre) for place in flat.places], axis=1), fit.rotation_rad
+    value = _displacement(fit, flat)
+    return replace(value, places_m=scale * value.places_m)
 
 
-def _camera_part(target: Target, used: Calibration, ground: Ground, flight: SmoothFlight | None) -> Floats:
+# --- standard deviations ---------------------------------------------------------------------------------------------
+
+
+def _sigma(
+    scene: _Scene,
+    target: Target,
+    value: Displacement,
+    *,
+    fit: RigidFit,
+    points: Displacement,
+    slow_m: Floats,
+    measured: Bools,
+) -> Displacement:
+    """Return the standard deviation of each frame's displacement.
+
+    Args:
+        fit: motion of the target's lines or points, without the texture about them.
+        points: standard deviation by the scatter of the target's own points.
+        slow_m: (F, 2, 2) what the uncertainty of the calibration moves P1 and P2 by.
+        measured: (F,) frames.
+    """
+    time_s, intervals = scene.recording.time_s, scene.project.intervals_s
+    still, after = during(time_s, intervals.pre_event), during(time_s, intervals.residual)
+    alike_m = common_error(fit.residual, time_s, still & measured)
+    return combined_sigma(
+        points,
+        camera_m=_camera_part(scene, target),
+        shared_m=np.hypot(_ground_part(scene, target), alike_m),
+        slow_m=slow_m,
+        value=value,
+        still=still & measured,
+        moving=~(still | after),
+        after=after & measured,
+    )
+
+
+def _camera_part(scene: _Scene, target: Target) -> Floats:
     """Return what the noise left in the camera's path moves a target by, (F, 2) metres."""
-    centre_sigma_m = _sigma_of_centres(ground) if flight is None else flight.sigma_m
+    used, flight = scene.used, scene.flight
+    centre_sigma_m = _sigma_of_centres(scene.ground) if flight is None else flight.sigma_m
     return np.asarray(used.heights_m[target.name] / used.pose0.centre_m[2] * centre_sigma_m[:, :2])
 
 
-def _ground_part(target: Target, used: Calibration, ground: Ground) -> Floats:
+def _ground_part(scene: _Scene, target: Target) -> Floats:
     """Return what the ground errs by as a whole, (F,) metres at a target's height."""
+    used = scene.used
     pixel_m = (used.pose0.centre_m[2] - used.heights_m[target.name]) / float(used.lens.focal_px.mean())
-    return np.asarray(GROUND_PART * ground.rms_px * pixel_m)
+    return np.asarray(GROUND_PART * scene.ground.rms_px * pixel_m)
 
 
 def _sigma_of_centres(ground: Ground) -> Floats:
@@ -328,7 +355,7 @@ def _sigma_of_centres(ground: Ground) -> Floats:
     return np.asarray(unit_sigma[:, None] * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)[:, 3:]))
 
 
-def _sigma_of_points(fit: RigidFit, body: RestBody) -> Sigma:
+def _sigma_of_points(fit: RigidFit, body: RestBody) -> Displacement:
     """Return what the scatter of a target's own points makes of its displacement and rotation."""
     covariance = np.linalg.pinv(fit.normal, hermitian=True)
     places = []
@@ -336,4 +363,4 @@ def _sigma_of_points(fit: RigidFit, body: RestBody) -> Sigma:
         arm = place - body.centre
         J = np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]]])
         places.append(np.sqrt(np.diagonal(J @ covariance @ J.T, axis1=1, axis2=2)))
-    return Sigma(np.stack(places, axis=1), np.sqrt(covariance[:, 2, 2]))
+    return Displacement(np.stack(places, axis=1), np.sqrt(covariance[:, 2, 2]))

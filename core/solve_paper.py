@@ -20,7 +20,7 @@ from core.measurements import Recording
 from core.motion import regress_lines
 from core.project import Project, Target
 from core.relief import Relief
-from core.results import TargetHistory
+from core.results import Displacement, TargetHistory
 from core.roof_level import doubts, refuse_if, scale_at_roof, scale_obstacle
 from core.solution import Ground, Solution, TargetSolution, frame_status
 from core.uncertainty import GROUND_PART, held_to_jitter
@@ -132,20 +132,15 @@ def _solve_target(
     still = during(recording.time_s, project.intervals_s.pre_event) & determined
     sigma = held_to_jitter(np.hypot(scale * spread[1:], ground_m[:, None, None]), moved, still)
     turned_sigma = held_to_jitter(np.sqrt((spread[1:] ** 2).sum(axis=(1, 2)) / 2) / distance, turned, still)
-    history = TargetHistory(
-        name=target.name,
+    displacement = Displacement(moved, turned)
+    history = TargetHistory.of(
+        target.name,
         frame=recording.frame,
         time_s=recording.time_s,
         status=status,
-        p1_m=moved[:, 0],
-        p2_m=moved[:, 1],
-        rotation_rad=turned,
-        p1_sigma_m=sigma[:, 0],
-        p2_sigma_m=sigma[:, 1],
-        rotation_sigma_rad=turned_sigma,
-        p1_raw_m=moved[:, 0],
-        p2_raw_m=moved[:, 1],
-        rotation_raw_rad=turned,
+        value=displacement,
+        sigma=Displacement(sigma, turned_sigma),
+        raw=displacement,
     )
     return TargetSolution(history=history, rest_m=_rest(target, reference, places[0]) + reference.origin_m)
 

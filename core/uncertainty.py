@@ -6,13 +6,13 @@ off the stationary part, where every departure is error.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from core.coordinates import Bools, Floats
-from core.results import TargetHistory
+from core.results import Displacement, TargetHistory
 from core.robust import BY_MEDIAN, finite_median, robust_sigma
 
 # What the ground errs by as a whole, as part of its features' scatter (measured on H.264 clips with exact truth).
@@ -38,14 +38,6 @@ LEAST_STILL = 30
 MOST_AFTER = 3.0
 # Bounds of the correction by the scatter at rest: beyond them something other than random error is at work.
 LEAST_FACTOR, MOST_FACTOR = 0.3, 8.0
-
-
-@dataclass(frozen=True)
-class Sigma:
-    """One standard deviation of P1 and P2 (F, 2, 2), metres, and of the rotation (F,), radians."""
-
-    places_m: Floats
-    rotation_rad: Floats
 
 
 def common_error(residual: Floats, time_s: Floats, still: Bools) -> Floats:
@@ -80,25 +72,24 @@ def _mean_where_mostly_seen(values: Floats) -> Floats:
 
 
 def combined_sigma(
-    points: Sigma,
+    points: Displacement,
     *,
     camera_m: Floats,
     shared_m: Floats,
     slow_m: Floats,
-    places_m: Floats,
-    rotation_rad: Floats,
+    value: Displacement,
     still: Bools,
     moving: Bools,
     after: Bools,
-) -> Sigma:
+) -> Displacement:
     """Return the standard deviation of each frame's values.
 
     Args:
-        points: as the scatter of the target's own points propagates.
+        points: standard deviation as the scatter of the target's own points propagates.
         camera_m: (F, 2) what the noise left in the camera's path moves the target by.
         shared_m: (F,) what ground and target err by as a whole.
         slow_m: (F, 2, 2) what the uncertainty of the calibration moves P1 and P2 by, from rest, as the camera drifts.
-        places_m: (F, 2, 2) displacements and rotation_rad (F,) whose scatter at rest is looked at.
+        value: whose scatter at rest is looked at.
         still: (F,) measured frames of the stationary part.
         moving: (F,) frames in no part in which the building stands still.
         after: (F,) measured frames of the part in which it stands still again.
@@ -106,14 +97,14 @@ def combined_sigma(
     random = np.sqrt(points.places_m**2 + camera_m[:, None, :] ** 2 + shared_m[:, None, None] ** 2)
     factor, rotation_factor = np.ones((2, 2)), 1.0
     if still.sum() >= LEAST_STILL:
-        factor = _by_scatter(np.hypot(random, slow_m)[still], places_m[still], MOST_FACTOR)
-        rotation_factor = float(_by_scatter(points.rotation_rad[still], rotation_rad[still], MOST_FACTOR))
+        factor = _by_scatter(np.hypot(random, slow_m)[still], value.places_m[still], MOST_FACTOR)
+        rotation_factor = float(_by_scatter(points.rotation_rad[still], value.rotation_rad[still], MOST_FACTOR))
     wider = np.where(moving, MOVING, 1.0) * np.sqrt(max(1.0, LEAST_STILL / len(moving)))
     places_sigma = np.sqrt((random * factor) ** 2 + slow_m**2) * wider[:, None, None]
     rotation_sigma = points.rotation_rad * rotation_factor * wider
-    return Sigma(
-        _widened_after(places_sigma, places_m, after),
-        _widened_after(rotation_sigma, rotation_rad, after),
+    return Displacement(
+        _widened_after(places_sigma, value.places_m, after),
+        _widened_after(rotation_sigma, value.rotation_rad, after),
     )
 
 

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from core.coordinates import Floats
-from core.results import TargetHistory
+from core.results import Displacement, TargetHistory
 from core.uncertainty import (
     LEAST_STILL,
     MOVING,
-    Sigma,
     combined_sigma,
     common_error,
     held_to_jitter,
@@ -23,15 +22,14 @@ MOVING_FRAMES = (np.arange(FRAMES) >= 150) & (np.arange(FRAMES) < 300)
 AFTER_FRAMES = np.arange(FRAMES) >= 300
 
 
-def combined(places_m: Floats, *, slow_m: float = 0.0, still: Floats = STILL) -> Sigma:
-    points = Sigma(np.full((FRAMES, 2, 2), 1e-4), np.full(FRAMES, 2e-5))
+def combined(places_m: Floats, *, slow_m: float = 0.0, still: Floats = STILL) -> Displacement:
+    points = Displacement(np.full((FRAMES, 2, 2), 1e-4), np.full(FRAMES, 2e-5))
     return combined_sigma(
         points,
         camera_m=np.full((FRAMES, 2), 5e-5),
         shared_m=np.full(FRAMES, 5e-5),
         slow_m=np.full((FRAMES, 2, 2), slow_m),
-        places_m=places_m,
-        rotation_rad=1e-5 * places_m[:, 0, 0] / places_m[:, 0, 0].std(),
+        value=Displacement(places_m, 1e-5 * places_m[:, 0, 0] / places_m[:, 0, 0].std()),
         still=np.asarray(still, dtype=bool),
         moving=MOVING_FRAMES,
         after=AFTER_FRAMES,
@@ -52,12 +50,11 @@ def test_error_bars_are_held_against_the_scatter_at_rest(places_m: Floats) -> No
 @pytest.mark.parametrize("frames", [1, 3, 29, 30, 60])
 def test_a_clip_of_few_frames_claims_less(frames: int) -> None:
     claimed = combined_sigma(
-        Sigma(np.full((frames, 2, 2), 3e-4), np.full(frames, 2e-5)),
+        Displacement(np.full((frames, 2, 2), 3e-4), np.full(frames, 2e-5)),
         camera_m=np.zeros((frames, 2)),
         shared_m=np.zeros(frames),
         slow_m=np.zeros((frames, 2, 2)),
-        places_m=np.zeros((frames, 2, 2)),
-        rotation_rad=np.zeros(frames),
+        value=Displacement(np.zeros((frames, 2, 2)), np.zeros(frames)),
         still=np.zeros(frames, dtype=bool),
         moving=np.zeros(frames, dtype=bool),
         after=np.zeros(frames, dtype=bool),
