@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 SAMPLE := workspace/sample
-# Two test processes by default: the engine inside a test uses threads of its own, and a browser alone fills two cores.
+# Two test processes by default: the engine inside a test uses threads of its own, and a browser fills most of two cores.
 TEST_PROCESSES ?= 2
 TEST_OPTIONS ?=
 # A Python to use instead of the one .ci/make-venv finds.
@@ -30,7 +30,7 @@ serve: $(VENV)/installed $(VENV)/libraries ## serve the browser interface over w
 .PHONY: test
 test: lint $(VENV)/libraries $(VENV)/browser ## lint, types and all tests
 	$(BIN)/python -m pytest --ignore=tests/browser -n $(TEST_PROCESSES) $(TEST_OPTIONS)
-	$(BIN)/python -m pytest tests/browser $(TEST_OPTIONS)
+	$(BIN)/python -m pytest tests/browser -n $(TEST_PROCESSES) --dist worksteal $(TEST_OPTIONS)
 
 .PHONY: lint
 lint: $(VENV)/tested ## style, format and types of everything
